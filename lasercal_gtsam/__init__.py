@@ -1,0 +1,73 @@
+"""Calibrate a robot cell from laser spots: camera, hand-eye, beam and planes, with sigmas.
+
+``import lasercal_gtsam as lc``: the public names below are loaded on first use, so that importing
+the package costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "Beam": "cell",
+    "Calibration": "calibration",
+    "CalibrationOptions": "options",
+    "Camera": "cell",
+    "Cell": "cell",
+    "DataError": "errors",
+    "DegenerateError": "errors",
+    "DetectionError": "errors",
+    "Intrinsics": "cell",
+    "LasercalError": "errors",
+    "Observations": "observations",
+    "Parameter": "calibration",
+    "Plane": "cell",
+    "SolveError": "errors",
+    "calibrate": "api",
+    "load_calibration": "io.calibration_file",
+    "load_capture": "io.capture",
+    "project": "projection",
+    "simulate": "simulate",
+    "spot_on_beam": "projection",
+    "spot_on_ray": "projection",
+    "spot_triangulated": "projection",
+}
+
+__all__ = sorted([*_EXPORTS, "__version__"])
+
+if TYPE_CHECKING:
+    from lasercal_gtsam.api import calibrate
+    from lasercal_gtsam.calibration import Calibration, Parameter
+    from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
+    from lasercal_gtsam.errors import (
+        DataError,
+        DegenerateError,
+        DetectionError,
+        LasercalError,
+        SolveError,
+    )
+    from lasercal_gtsam.io.calibration_file import load_calibration
+    from lasercal_gtsam.io.capture import load_capture
+    from lasercal_gtsam.observations import Observations
+    from lasercal_gtsam.options import CalibrationOptions
+    from lasercal_gtsam.projection import (
+        project,
+        spot_on_beam,
+        spot_on_ray,
+        spot_triangulated,
+    )
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _EXPORTS:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

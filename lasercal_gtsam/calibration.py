@@ -1,0 +1,210 @@
+"""The result of a calibration: estimates, sigmas, residuals, and how they came about."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.frozen import Array, FrozenData, set_array
+from lasercal_gtsam.observations import Names, Observations
+from lasercal_gtsam.options import CalibrationOptions
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One row of the result table, in the paper's parameterisation and units (mm, deg, px).
+
+    ``initial`` is NaN where the start does not define it; ``sigma`` is 0 for a value held fixed.
+    """
+
+    name: str
+    initial: float
+    refined: float
+    sigma: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How the fit went.
+
+    Attributes
+    ----------
+    rms_px : root of the mean squared distance between seen and predicted spot (the paper's RMS)
+    sigma0 : a-posteriori scale: pixel sigma (px) where none was given, else a factor on the given
+    dof : degrees of freedom behind ``sigma0`` (0: no sigma can be stated)
+    iterations : Levenberg-Marquardt iterations of the last solve
+    converged : whether every check passed
+    status : one sentence for a human
+    n_spots, n_rejected : spots used and spots left out as outliers
+    """
+
+    rms_px: float
+    sigma0: float
+    dof: float
+    iterations: int
+    converged: bool
+    status: str
+    n_spots: int
+    n_rejected: int
+
+
+@dataclass(frozen=True)
+class SpotResult:
+    """The account of one spot: residual ``predicted - seen`` (px), weight, why it was rejected."""
+
+    id: str
+    plane: str
+    camera: str
+    laser: str
+    residual_px: tuple[float, float]
+    weight: float
+    rejected: str | None
+
+
+@dataclass(frozen=True, eq=False)
+class SpotResults(FrozenData):
+    """All spots as columns; iterating or indexing gives `SpotResult`."""
+
+    id: Names
+    plane: Names
+    camera: Names
+    laser: Names
+    residual_px: Array
+    weight: Array
+    rejected: tuple[str | None, ...]
+
+    def __post_init__(self) -> None:
+        n = len(set_array(self, "residual_px", self.residual_px, (None, 2), finite=False))
+        set_array(self, "weight", self.weight, (n,))
+
+    def __len__(self) -> int:
+        return len(self.residual_px)
+
+    def __getitem__(self, k: int) -> SpotResult:
+        return SpotResult(
+            id=str(self.id[k]),
+            plane=str(self.plane[k]),
+            camera=str(self.camera[k]),
+            laser=str(self.laser[k]),
+            residual_px=(float(self.residual_px[k, 0]), float(self.residual_px[k, 1])),
+            weight=float(self.weight[k]),
+            rejected=self.rejected[k],
+        )
+
+    def __iter__(self) -> Iterator[SpotResult]:
+        return (self[k] for k in range(len(self)))
+
+
+@dataclass(frozen=True)
+class WeakDirection:
+    """A combination of parameters the data hardly determine.
+
+    ``strength`` is the information along it in units of the plausible range (below 1: the data
+    say less than plain common sense); ``words`` says what moves together, in units.
+    """
+
+    strength: float
+    words: str
+
+
+@dataclass(frozen=True)
+class Observability:
+    """Weak directions (weakest first), what was held fixed or tied, and remarks."""
+
+    weak: tuple[WeakDirection, ...] = ()
+    held: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What went in, so that a result can be recomputed."""
+
+    observations: Observations
+    options: CalibrationOptions
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(FrozenData):
+    """A calibrated cell with its joint covariance and the account of every spot.
+
+    Attributes
+    ----------
+    cell, initial : the estimate and the start it came from
+    parameters : rows of the paper's Table 2, in its order
+    covariance : (n, n) joint covariance in the tangent space, SI units; rows as in ``labels``
+    labels : names of the tangent coordinates
+    fit, spots, observability, inputs : see their classes
+    """
+
+    cell: Cell
+    initial: Cell
+    parameters: tuple[Parameter, ...]
+    covariance: Array
+    labels: tuple[str, ...]
+    fit: Fit
+    spots: SpotResults
+    observability: Observability
+    inputs: Inputs
+
+    def __post_init__(self) -> None:
+        n = len(self.labels)
+        set_array(self, "covariance", self.covariance, (n, n), finite=False)
+
+    def __getitem__(self, name: str) -> Parameter:
+        """Return the row of that name; KeyError lists the names."""
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(f"{name!r}; there are {', '.join(p.name for p in self.parameters)}")
+
+    def table(self) -> str:
+        """Text of the paper's Table 2: Initial | Refined | sigma | Unit, RMS row last."""
+        lines = [("", "Initial", "Refined", "sigma", "Unit")]
+        lines += [_table_row(p) for p in self.parameters]
+        lines.append(("RMS", "", f"{self.fit.rms_px:.4g}", "", "px"))
+        widths = [max(len(line[i]) for line in lines) for i in range(5)]
+        rows = [
+            f"{a:<{widths[0]}} | {b:>{widths[1]}} | {c:>{widths[2]}} | {d:>{widths[3]}} | {e}".rstrip()
+            for a, b, c, d, e in lines
+        ]
+        rule = "-+-".join("-" * w for w in widths)
+        return "\n".join([rows[0], rule, *rows[1:-1], rule, rows[-1]])
+
+    def save(self, path: str | Path) -> None:
+        """Write ``calibration.json`` (atomically: the old file stays until the new one is whole)."""
+        from lasercal_gtsam.io.calibration_file import save_calibration
+
+        save_calibration(self, path)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of ``calibration.json``."""
+        from lasercal_gtsam.io.calibration_file import to_dict
+
+        return to_dict(self)
+
+
+def _table_row(p: Parameter) -> tuple[str, str, str, str, str]:
+    """Decimals follow the sigma (two significant digits of it), as a metrologist prints them."""
+    if not np.isfinite(p.sigma):
+        return p.name, _plain(p.initial, 4), _plain(p.refined, 4), "unknown", p.unit
+    if p.sigma <= 0:
+        return p.name, _plain(p.initial, 4), _plain(p.refined, 4), "held", p.unit
+    decimals = int(np.clip(1 - np.floor(np.log10(p.sigma)), 0, 9))
+    sigma = f"{p.sigma:.{decimals}f}"
+    return p.name, _plain(p.initial, decimals), _plain(p.refined, decimals), sigma, p.unit
+
+
+def _plain(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}" if np.isfinite(value) else ""
+
+
+def rms_px(residual_px: Array) -> float:
+    """Table 2's RMS: root of the mean squared residual length, px."""
+    return float(np.sqrt(np.mean(np.sum(residual_px**2, axis=1)))) if len(residual_px) else 0.0

@@ -1,0 +1,74 @@
+"""Rotations as the paper writes them, and small helpers on poses (4x4 arrays)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lasercal_gtsam.frozen import Array
+
+
+def rotation_from_zyx(theta: float, phi: float, psi: float) -> Array:
+    """``R = Rz(theta) Ry(phi) Rx(psi)``, angles in radians (method note 1.1)."""
+    (ct, cp, cs), (st, sp, ss) = np.cos([theta, phi, psi]), np.sin([theta, phi, psi])
+    return np.array(
+        [
+            [ct * cp, ct * sp * ss - st * cs, ct * sp * cs + st * ss],
+            [st * cp, st * sp * ss + ct * cs, st * sp * cs - ct * ss],
+            [-sp, cp * ss, cp * cs],
+        ]
+    )
+
+
+def zyx_from_rotation(R: Array) -> Array:
+    """``(theta, phi, psi)`` in radians with ``R = Rz(theta) Ry(phi) Rx(psi)``; phi in [-90, 90] deg."""
+    return np.array(
+        [
+            np.arctan2(R[1, 0], R[0, 0]),
+            np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])),
+            np.arctan2(R[2, 1], R[2, 2]),
+        ]
+    )
+
+
+def skew(v: Array) -> Array:
+    """``[v]x`` with ``skew(a) @ b = a x b``."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def rotation_exp(w: Array) -> Array:
+    """Rotation matrix of the rotation vector ``w`` (radians), Rodrigues' formula."""
+    angle = float(np.linalg.norm(w))
+    W = skew(w)
+    if angle < 1e-8:
+        return np.eye(3) + W + 0.5 * W @ W
+    return np.eye(3) + np.sin(angle) / angle * W + (1 - np.cos(angle)) / angle**2 * W @ W
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Closest rotation matrix in the Frobenius norm (stacks allowed, shape (..., 3, 3))."""
+    U, _, Vt = np.linalg.svd(M)
+    sign = np.ones(M.shape[:-2] + (3,))
+    sign[..., 2] = np.sign(np.linalg.det(U @ Vt))
+    return np.asarray((U * sign[..., None, :]) @ Vt)
+
+
+def make_pose(R: Array, t: Array) -> Array:
+    """Assemble the 4x4 transform of rotation ``R`` and translation ``t``."""
+    T = np.eye(4)
+    T[:3, :3] = R
+    T[:3, 3] = t
+    return T
+
+
+def basis_of(v: Array) -> Array:
+    """``E_v``: 3x2 orthonormal basis of the plane across ``v`` with ``e1 x e2 = v/|v|``.
+
+    Deterministic and built from the coordinate axis least aligned with ``v``.
+    """
+    v = v / np.linalg.norm(v)
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(v))] = 1.0
+    e1 = np.cross(v, axis)
+    e1 /= np.linalg.norm(e1)
+    return np.column_stack([e1, np.cross(v, e1)])
