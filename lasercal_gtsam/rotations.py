@@ -48,7 +48,7 @@ def rotation_exp(w: Array) -> Array:
 def nearest_rotation(M: Array) -> Array:
     """Closest rotation matrix in the Frobenius norm (stacks allowed, shape (..., 3, 3))."""
     U, _, Vt = np.linalg.svd(M)
-    sign = np.ones(M.shape[:-2] + (3,))
+    sign = np.ones((*M.shape[:-2], 3))
     sign[..., 2] = np.sign(np.linalg.det(U @ Vt))
     return np.asarray((U * sign[..., None, :]) @ Vt)
 
