@@ -20,7 +20,7 @@ def rotation_from_zyx(theta: float, phi: float, psi: float) -> Array:
 
 
 def zyx_from_rotation(R: Array) -> Array:
-    """``(theta, phi, psi)`` in radians with ``R = Rz(theta) Ry(phi) Rx(psi)``; phi in [-90, 90] deg."""
+    """``(theta, phi, psi)`` in radians with ``R = Rz(theta) Ry(phi) Rx(psi)``; phi in +-90 deg."""
     return np.array(
         [
             np.arctan2(R[1, 0], R[0, 0]),
@@ -31,18 +31,22 @@ def zyx_from_rotation(R: Array) -> Array:
 
 
 def skew(v: Array) -> Array:
-    """``[v]x`` with ``skew(a) @ b = a x b``."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """``[v]x`` with ``skew(a) @ b = a x b`` (stacks allowed, shape (..., 3))."""
+    v = np.asarray(v)
+    W = np.zeros((*v.shape[:-1], 3, 3))
+    W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
+    return W - np.swapaxes(W, -1, -2)
 
 
 def rotation_exp(w: Array) -> Array:
-    """Rotation matrix of the rotation vector ``w`` (radians), Rodrigues' formula."""
-    angle = float(np.linalg.norm(w))
+    """Rotation matrix of the rotation vector ``w`` (radians; stacks allowed, shape (..., 3)).
+
+    Rodrigues' formula in terms of sinc, which needs no special case for small angles.
+    """
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
     W = skew(w)
-    if angle < 1e-8:
-        return np.eye(3) + W + 0.5 * W @ W
-    return np.eye(3) + np.sin(angle) / angle * W + (1 - np.cos(angle)) / angle**2 * W @ W
+    half = np.sinc(angle / (2 * np.pi))
+    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * half**2 * (W @ W))
 
 
 def nearest_rotation(M: Array) -> Array:
