@@ -1,0 +1,378 @@
+"""Compiled loops over many spots: beam -> plane -> camera -> pixel, with derivatives.
+
+Raw float64 arrays in SI units and pixels; no objects. Every function sees the spots sorted into
+*blocks*: the spots of one block share camera, laser and plane, so that the 22 unknowns a spot
+depends on are the same for the whole block.
+
+Arrays of a batch
+-----------------
+uv (N, 2), R_base_hand (N, 3, 3), t_base_hand (N, 3)
+whitening (N, 3): ``w00, w01, w11`` of the upper triangle ``W`` with ``W.T @ W = inv(cov_uv)``
+blocks (M, 5): camera, laser, plane index, first spot, one past the last spot
+
+Arrays of a state (C cameras, L lasers, P planes)
+-------------------------------------------------
+cam_R (C, 3, 3), cam_t (C, 3): ``T_base_camera``; cam_K (C, 9): ``fu fv skew u0 v0 k1 k2 p1 p2``
+beam_R (L, 3, 3), beam_t (L, 3), beam_l (L, 4): constant frame and ``a, b, x, y``: the beam runs along
+``beam_R (a, b, 1)`` through ``beam_t + beam_R (x, y, 0)``, in hand coordinates
+plane_n (P, 3), plane_B (P, 3, 2), plane_d (P,): ``n . x = d``; ``B`` = basis of the normal's tangent
+
+Columns of a spot's row: camera pose 6 (rotation first, camera frame, as `gtsam.Pose3`), intrinsics 9,
+beam 4, plane 3 (normal 2, then the offset **as GTSAM stores it**, ``-d``), and the residual last.
+The residual is predicted minus seen pixel (paper, eq. 55), whitened.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+LOSS_NONE, LOSS_HUBER, LOSS_CAUCHY, LOSS_GEMAN_MCCLURE = 0, 1, 2, 3
+COLUMNS = 23
+
+_jit = njit(cache=True, nogil=True, error_model="numpy")
+
+
+@_jit
+def loss_value(kind: int, c: float, m: float) -> float:
+    """Robust loss of the squared whitened residual length ``m``; equals ``m`` for small ``m``."""
+    if kind == 1:
+        return m if m <= c * c else 2.0 * c * math.sqrt(m) - c * c
+    if kind == 2:
+        return c * c * math.log1p(m / (c * c))
+    if kind == 3:
+        return m * c * c / (c * c + m)
+    return m
+
+
+@_jit
+def loss_weight(kind: int, c: float, m: float) -> float:
+    """Derivative of `loss_value`: the weight of the spot."""
+    if kind == 1:
+        return 1.0 if m <= c * c else c / math.sqrt(m)
+    if kind == 2:
+        return 1.0 / (1.0 + m / (c * c))
+    if kind == 3:
+        w = c * c / (c * c + m)
+        return w * w
+    return 1.0
+
+
+@_jit
+def _beam_in_hand(R, t, l):  # type: ignore[no-untyped-def]  # noqa: E741
+    """Direction (not normalised) and point of a beam in hand coordinates."""
+    u = np.empty(3)
+    q = np.empty(3)
+    for i in range(3):
+        u[i] = R[i, 0] * l[0] + R[i, 1] * l[1] + R[i, 2]
+        q[i] = t[i] + R[i, 0] * l[2] + R[i, 1] * l[3]
+    return u, q
+
+
+@_jit
+def _residual(uv, Rh, th, u, q, n, d, Rc, tc, K):  # type: ignore[no-untyped-def]
+    """(ok, du, dv): predicted minus seen pixel (8), (9), (1)-(3); not ok: no spot can be there.
+
+    Not ok means: beam parallel to or away from the plane, spot behind the camera, or beyond the
+    radius where the radial distortion turns back on itself.
+    """
+    b0 = Rh[0, 0] * u[0] + Rh[0, 1] * u[1] + Rh[0, 2] * u[2]
+    b1 = Rh[1, 0] * u[0] + Rh[1, 1] * u[1] + Rh[1, 2] * u[2]
+    b2 = Rh[2, 0] * u[0] + Rh[2, 1] * u[1] + Rh[2, 2] * u[2]
+    x0 = Rh[0, 0] * q[0] + Rh[0, 1] * q[1] + Rh[0, 2] * q[2] + th[0]
+    x1 = Rh[1, 0] * q[0] + Rh[1, 1] * q[1] + Rh[1, 2] * q[2] + th[1]
+    x2 = Rh[2, 0] * q[0] + Rh[2, 1] * q[1] + Rh[2, 2] * q[2] + th[2]
+    s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) / (n[0] * b0 + n[1] * b1 + n[2] * b2)
+    x0 += s * b0 - tc[0]
+    x1 += s * b1 - tc[1]
+    x2 += s * b2 - tc[2]
+    z = Rc[0, 2] * x0 + Rc[1, 2] * x1 + Rc[2, 2] * x2
+    x = (Rc[0, 0] * x0 + Rc[1, 0] * x1 + Rc[2, 0] * x2) / z
+    y = (Rc[0, 1] * x0 + Rc[1, 1] * x1 + Rc[2, 1] * x2) / z
+    k1, k2, p1, p2 = K[5], K[6], K[7], K[8]
+    r2 = x * x + y * y
+    g = 1.0 + r2 * (k1 + k2 * r2)
+    xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    ok = s > 0.0 and z > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
+    return ok, K[0] * xd + K[2] * yd + K[3] - uv[0], K[1] * yd + K[4] - uv[1]
+
+
+@_jit
+def _row(uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J):  # type: ignore[no-untyped-def]
+    """Fill the whitened 2x23 row ``J`` of one spot (method: chain rule); False as in `_residual`."""
+    # beam in base and its hit on the plane (8), (9)
+    b0 = Rh[0, 0] * u[0] + Rh[0, 1] * u[1] + Rh[0, 2] * u[2]
+    b1 = Rh[1, 0] * u[0] + Rh[1, 1] * u[1] + Rh[1, 2] * u[2]
+    b2 = Rh[2, 0] * u[0] + Rh[2, 1] * u[1] + Rh[2, 2] * u[2]
+    x0 = Rh[0, 0] * q[0] + Rh[0, 1] * q[1] + Rh[0, 2] * q[2] + th[0]
+    x1 = Rh[1, 0] * q[0] + Rh[1, 1] * q[1] + Rh[1, 2] * q[2] + th[1]
+    x2 = Rh[2, 0] * q[0] + Rh[2, 1] * q[1] + Rh[2, 2] * q[2] + th[2]
+    inu = 1.0 / (n[0] * b0 + n[1] * b1 + n[2] * b2)
+    s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) * inu
+    x0 += s * b0
+    x1 += s * b1
+    x2 += s * b2
+    # in the camera
+    c0, c1, c2 = x0 - tc[0], x1 - tc[1], x2 - tc[2]
+    px = Rc[0, 0] * c0 + Rc[1, 0] * c1 + Rc[2, 0] * c2
+    py = Rc[0, 1] * c0 + Rc[1, 1] * c1 + Rc[2, 1] * c2
+    pz = Rc[0, 2] * c0 + Rc[1, 2] * c1 + Rc[2, 2] * c2
+    iz = 1.0 / pz
+    x, y = px * iz, py * iz
+    fu, fv, sk, k1, k2, p1, p2 = K[0], K[1], K[2], K[5], K[6], K[7], K[8]
+    r2 = x * x + y * y
+    g = 1.0 + r2 * (k1 + k2 * r2)
+    xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    w00, w01, w11 = W[0], W[1], W[2]
+    du = fu * xd + sk * yd + K[3] - uv[0]
+    dv = fv * yd + K[4] - uv[1]
+    J[0, 22] = w00 * du + w01 * dv
+    J[1, 22] = w11 * dv
+    # whitened pixel with respect to the distorted coordinates, M = W [[fu, sk], [0, fv]]
+    m00, m01, m11 = w00 * fu, w00 * sk + w01 * fv, w11 * fv
+    # intrinsics
+    J[0, 6] = w00 * xd
+    J[1, 6] = 0.0
+    J[0, 7] = w01 * yd
+    J[1, 7] = w11 * yd
+    J[0, 8] = w00 * yd
+    J[1, 8] = 0.0
+    J[0, 9] = w00
+    J[1, 9] = 0.0
+    J[0, 10] = w01
+    J[1, 10] = w11
+    J[0, 11] = (m00 * x + m01 * y) * r2
+    J[1, 11] = m11 * y * r2
+    J[0, 12] = J[0, 11] * r2
+    J[1, 12] = J[1, 11] * r2
+    a, b = 2.0 * x * y, r2 + 2.0 * y * y
+    J[0, 13] = m00 * a + m01 * b
+    J[1, 13] = m11 * b
+    b = r2 + 2.0 * x * x
+    J[0, 14] = m00 * b + m01 * a
+    J[1, 14] = m11 * a
+    # point in the camera: N = M d(xd, yd)/d(x, y), then d(x, y)/dp
+    dg = k1 + 2.0 * k2 * r2
+    d00 = g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x
+    d01 = 2.0 * x * y * dg + 2.0 * p1 * x + 2.0 * p2 * y
+    d11 = g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x
+    for i in range(2):
+        if i == 0:
+            n0, n1 = (m00 * d00 + m01 * d01) * iz, (m00 * d01 + m01 * d11) * iz
+        else:
+            n0, n1 = m11 * d01 * iz, m11 * d11 * iz
+        n2 = -(n0 * x + n1 * y)
+        # camera pose: dp = [p]x w - v (right perturbation, as Pose3)
+        J[i, 0] = n1 * pz - n2 * py
+        J[i, 1] = n2 * px - n0 * pz
+        J[i, 2] = n0 * py - n1 * px
+        J[i, 3] = -n0
+        J[i, 4] = -n1
+        J[i, 5] = -n2
+        # point in the base
+        g0 = Rc[0, 0] * n0 + Rc[0, 1] * n1 + Rc[0, 2] * n2
+        g1 = Rc[1, 0] * n0 + Rc[1, 1] * n1 + Rc[1, 2] * n2
+        g2 = Rc[2, 0] * n0 + Rc[2, 1] * n1 + Rc[2, 2] * n2
+        along = (g0 * b0 + g1 * b1 + g2 * b2) * inu
+        # plane: dX = u/nu (-X.dn + dd); GTSAM's offset is -d
+        J[i, 19] = -along * (x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0])
+        J[i, 20] = -along * (x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1])
+        J[i, 21] = -along
+        # beam: dX = (I - u n^T/nu) R_base_hand (dq + s du)
+        g0 -= along * n[0]
+        g1 -= along * n[1]
+        g2 -= along * n[2]
+        h0 = g0 * Rh[0, 0] + g1 * Rh[1, 0] + g2 * Rh[2, 0]
+        h1 = g0 * Rh[0, 1] + g1 * Rh[1, 1] + g2 * Rh[2, 1]
+        h2 = g0 * Rh[0, 2] + g1 * Rh[1, 2] + g2 * Rh[2, 2]
+        J[i, 17] = h0 * Rl[0, 0] + h1 * Rl[1, 0] + h2 * Rl[2, 0]
+        J[i, 18] = h0 * Rl[0, 1] + h1 * Rl[1, 1] + h2 * Rl[2, 1]
+        J[i, 15] = s * J[i, 17]
+        J[i, 16] = s * J[i, 18]
+    return s > 0.0 and pz > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
+
+
+@_jit
+def residuals(uv, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
+              plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
+    out = np.empty(uv.shape)
+    for m in range(len(blocks)):
+        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        for k in range(blocks[m, 3], blocks[m, 4]):
+            ok, du, dv = _residual(
+                uv[k], R_base_hand[k], t_base_hand[k], u, q, plane_n[p], plane_d[p],
+                cam_R[c], cam_t[c], cam_K[c],
+            )  # fmt: skip
+            out[k, 0] = du if ok else np.nan
+            out[k, 1] = dv if ok else np.nan
+    return out
+
+
+@_jit
+def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
+               beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
+    total = 0.0
+    for m in range(len(blocks)):
+        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        for k in range(blocks[m, 3], blocks[m, 4]):
+            ok, du, dv = _residual(
+                uv[k], R_base_hand[k], t_base_hand[k], u, q, plane_n[p], plane_d[p],
+                cam_R[c], cam_t[c], cam_K[c],
+            )  # fmt: skip
+            if not ok:
+                return np.inf
+            e0 = whitening[k, 0] * du + whitening[k, 1] * dv
+            e1 = whitening[k, 2] * dv
+            total += loss_value(kind, c_loss, e0 * e0 + e1 * e1)
+    return total if math.isfinite(total) else np.inf
+
+
+@_jit
+def rows(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
+         beam_R, beam_t, beam_l, plane_n, plane_B, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Whitened Jacobian and residual of every spot, (N, 2, 23); NaN where no spot can be."""
+    out = np.empty((len(uv), 2, 23))
+    for m in range(len(blocks)):
+        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        for k in range(blocks[m, 3], blocks[m, 4]):
+            ok = _row(
+                uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
+                plane_n[p], plane_B[p], plane_d[p], cam_R[c], cam_t[c], cam_K[c], out[k],
+            )  # fmt: skip
+            if not ok:
+                out[k] = np.nan
+    return out
+
+
+@_jit
+def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam_R, cam_t, cam_K,
+                beam_R, beam_t, beam_l, plane_n, plane_B, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
+
+    ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
+    """
+    H = np.zeros((n + 1, n + 1))
+    J = np.empty((2, 23))
+    local = np.empty((23, 23))
+    column = np.empty(23, np.int64)
+    for m in range(len(blocks)):
+        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        local[:] = 0.0
+        for k in range(blocks[m, 3], blocks[m, 4]):
+            ok = _row(
+                uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
+                plane_n[p], plane_B[p], plane_d[p], cam_R[c], cam_t[c], cam_K[c], J,
+            )  # fmt: skip
+            if not ok:
+                H[0, 0] = np.nan
+                return H
+            w = 1.0
+            if kind != 0:
+                w = loss_weight(kind, c_loss, J[0, 22] * J[0, 22] + J[1, 22] * J[1, 22])
+            for i in range(23):
+                a, b = w * J[0, i], w * J[1, i]
+                for j in range(i, 23):
+                    local[i, j] += a * J[0, j] + b * J[1, j]
+        for i in range(6):
+            column[i] = offsets[m, 0] + i
+        for i in range(9):
+            column[6 + i] = offsets[m, 1] + i
+        for i in range(4):
+            column[15 + i] = offsets[m, 2] + i
+        for i in range(3):
+            column[19 + i] = offsets[m, 3] + i
+        column[22] = n
+        for i in range(23):
+            for j in range(i, 23):
+                a, b = column[i], column[j]
+                if a <= b:
+                    H[a, b] += local[i, j]
+                else:
+                    H[b, a] += local[i, j]
+    return H
+
+
+@_jit
+def constrain(H, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-def]
+    """Apply ties and held columns to an augmented information in place (upper triangle).
+
+    A tie makes the unknown ``from`` move as ``ratio`` times ``to``: its column is added to that of
+    ``to``. Held (and tied) columns are cleared and get a unit pin on the diagonal, so that they do
+    not move and the rest is as if they were not there.
+    """
+    size = len(H)
+    for t in range(len(tie_from)):
+        f, g, a = tie_from[t], tie_to[t], tie_ratio[t]
+        ff = H[f, f]
+        fg = H[f, g] if f < g else H[g, f]
+        for j in range(size):
+            if j != g:
+                v = a * (H[f, j] if f <= j else H[j, f])
+                if g < j:
+                    H[g, j] += v
+                else:
+                    H[j, g] += v
+        H[g, g] += 2.0 * a * fg + a * a * ff
+    for i in range(size - 1):
+        if held[i]:
+            for j in range(size):
+                if i <= j:
+                    H[i, j] = 0.0
+                else:
+                    H[j, i] = 0.0
+            H[i, i] = 1.0
+
+
+@_jit
+def cholesky(H):  # type: ignore[no-untyped-def]
+    """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1), Fortran order; zero rows for null pivots."""
+    size = len(H)
+    Rt = np.zeros((size, size))
+    for i in range(size):
+        pivot = H[i, i]
+        for k in range(i):
+            pivot -= Rt[i, k] * Rt[i, k]
+        if not pivot > 1e-15 * H[i, i]:
+            continue
+        root = math.sqrt(pivot)
+        Rt[i, i] = root
+        for j in range(i + 1, size):
+            v = H[i, j]
+            for k in range(i):
+                v -= Rt[i, k] * Rt[j, k]
+            Rt[j, i] = v / root
+    return Rt.T
+
+
+@_jit
+def tangent_basis(n):  # type: ignore[no-untyped-def]
+    """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
+    a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
+    axis = np.zeros(3)
+    if a0 <= a1 and a0 <= a2:
+        axis[0] = 1.0
+    elif a1 <= a0 and a1 <= a2:
+        axis[1] = 1.0
+    else:
+        axis[2] = 1.0
+    B = np.empty((3, 2))
+    e = np.array(
+        [n[1] * axis[2] - n[2] * axis[1], n[2] * axis[0] - n[0] * axis[2],
+         n[0] * axis[1] - n[1] * axis[0]]
+    )  # fmt: skip
+    e /= math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    B[:, 0] = e
+    B[0, 1] = n[1] * e[2] - n[2] * e[1]
+    B[1, 1] = n[2] * e[0] - n[0] * e[2]
+    B[2, 1] = n[0] * e[1] - n[1] * e[0]
+    return B

@@ -1,0 +1,419 @@
+"""Factors for laser spots: one spot at a time, or all spots of a cell in one factor.
+
+Both say the same: predicted minus seen pixel (paper, eq. 55) of the chain beam -> plane -> camera.
+`LaserSpotFactor` is the textbook custom factor for a graph of your own. `LaserSpotBatchFactor` holds
+any number of spots; it hands GTSAM the square root of their information instead of their rows, so
+that the cost of a linearisation inside GTSAM does not depend on the number of spots.
+
+Variables
+---------
+camera pose `gtsam.Pose3` (``T_base_camera``), intrinsics `gtsam.Cal3DS2`, beam 4-vector about a
+`BeamFrame` (hand coordinates), plane `gtsam.OrientedPlane3` (base; GTSAM's ``n.x + d = 0``).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import gtsam
+import numpy as np
+import numpy.typing as npt
+
+from lasercal_factors import kernels
+from lasercal_factors.beam import BeamFrame
+from lasercal_factors.errors import FactorError
+from lasercal_factors.wrap import custom_factor
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+LossName = Literal["none", "huber", "cauchy", "geman-mcclure"]
+LOSSES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman-mcclure": 3}
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Robust loss on the whitened length of a spot's residual; ``threshold`` in sigmas."""
+
+    name: LossName = "none"
+    threshold: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.name not in LOSSES or not self.threshold > 0:
+            raise FactorError(f"loss: one of {', '.join(LOSSES)}, threshold > 0; got {self}")
+
+
+class State(NamedTuple):
+    """Values of a cell's variables as plain arrays (see `kernels`)."""
+
+    cam_R: Array
+    cam_t: Array
+    cam_K: Array
+    beam_R: Array
+    beam_t: Array
+    beam_l: Array
+    plane_n: Array
+    plane_d: Array
+
+
+@dataclass(frozen=True)
+class CellKeys:
+    """Keys of a cell's variables, in the column order of the batch factor.
+
+    ``cameras`` holds (pose key, intrinsics key) pairs; ``frames`` one `BeamFrame` for each laser;
+    ``aspects`` an optional fixed ``fu / fv`` for each camera (then ``fu`` follows ``fv``).
+    """
+
+    cameras: tuple[tuple[int, int], ...]
+    lasers: tuple[int, ...]
+    planes: tuple[int, ...]
+    frames: tuple[BeamFrame, ...]
+    aspects: tuple[float | None, ...] = ()
+
+    def __post_init__(self) -> None:
+        if len(self.frames) != len(self.lasers):
+            raise FactorError(f"{len(self.lasers)} lasers but {len(self.frames)} beam frames")
+        if not self.aspects:
+            object.__setattr__(self, "aspects", (None,) * len(self.cameras))
+
+    @cached_property
+    def keys(self) -> tuple[int, ...]:
+        """All keys: every camera's pose and intrinsics, then lasers, then planes."""
+        return (*(k for pair in self.cameras for k in pair), *self.lasers, *self.planes)
+
+    @cached_property
+    def dims(self) -> tuple[int, ...]:
+        """Tangent dimension of each key."""
+        return (*(6, 9) * len(self.cameras), *(4,) * len(self.lasers), *(3,) * len(self.planes))
+
+    @cached_property
+    def columns(self) -> tuple[slice, ...]:
+        """Columns of each key."""
+        ends = np.cumsum(self.dims)
+        return tuple(slice(int(e) - d, int(e)) for e, d in zip(ends, self.dims, strict=True))
+
+    @cached_property
+    def n(self) -> int:
+        """Number of columns."""
+        return sum(self.dims)
+
+    @cached_property
+    def _frame_arrays(self) -> tuple[Array, Array]:
+        return np.array([f.R for f in self.frames]), np.array([f.t for f in self.frames])
+
+    def read(self, values: gtsam.Values) -> State:
+        """Arrays of the variables in ``values``."""
+        poses = [values.atPose3(x) for x, _ in self.cameras]
+        cam_K = np.array([values.atCal3DS2(k).vector() for _, k in self.cameras])
+        for c, aspect in enumerate(self.aspects):
+            if aspect is not None:
+                cam_K[c, 0] = aspect * cam_K[c, 1]
+        planes = np.array([values.atOrientedPlane3(p).planeCoefficients() for p in self.planes])
+        return State(
+            np.array([p.rotation().matrix() for p in poses]),
+            np.array([p.translation() for p in poses]),
+            cam_K,
+            *self._frame_arrays,
+            np.array([values.atVector(x) for x in self.lasers]),
+            np.ascontiguousarray(planes[:, :3]),
+            -planes[:, 3],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class SpotBatch:
+    """Spots sorted into blocks of equal camera, laser and plane; build it with `from_arrays`.
+
+    ``order`` says which input spot each row is: ``uv == uv_input[order]``.
+    """
+
+    uv: Array
+    whitening: Array
+    R_base_hand: Array
+    t_base_hand: Array
+    blocks: Index
+    order: Index
+
+    @classmethod
+    def from_arrays(
+        cls,
+        uv: npt.ArrayLike,
+        cov_uv: npt.ArrayLike,
+        T_base_hand: npt.ArrayLike,
+        camera: npt.ArrayLike,
+        laser: npt.ArrayLike,
+        plane: npt.ArrayLike,
+    ) -> SpotBatch:
+        """Sort and whiten.
+
+        Parameters
+        ----------
+        uv : (N, 2) px
+        cov_uv : (N, 2, 2) px^2, positive definite
+        T_base_hand : (N, 4, 4), metres
+        camera, laser, plane : (N,) indices into the keys of `CellKeys`
+
+        Raises
+        ------
+        FactorError
+            On shapes that do not fit, no spots, or a covariance that is not positive definite.
+        """
+        uv, T = np.asarray(uv, dtype=np.float64), np.asarray(T_base_hand, dtype=np.float64)
+        count = len(uv)
+        who = np.column_stack([np.asarray(x, dtype=np.int64) for x in (camera, laser, plane)])
+        if not count or uv.shape != (count, 2) or T.shape != (count, 4, 4) or len(who) != count:
+            raise FactorError(
+                f"spots: uv {uv.shape}, T_base_hand {T.shape}, {len(who)} indices; expected (N, 2), "
+                "(N, 4, 4) and N with N > 0"
+            )
+        order = np.lexsort((who[:, 2], who[:, 1], who[:, 0]))
+        who = who[order]
+        first = np.flatnonzero(np.r_[True, np.any(who[1:] != who[:-1], axis=1)])
+        blocks = np.column_stack([who[first], first, np.r_[first[1:], count]])
+        T = T[order]
+        return cls(
+            np.ascontiguousarray(uv[order]),
+            whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64)[order]),
+            np.ascontiguousarray(T[:, :3, :3]),
+            np.ascontiguousarray(T[:, :3, 3]),
+            np.ascontiguousarray(blocks),
+            order,
+        )
+
+    def __len__(self) -> int:
+        return len(self.uv)
+
+    def weighted(self, weights: npt.ArrayLike) -> SpotBatch:
+        """Return the same spots with their information multiplied by weights (N,), in input order."""
+        root = np.sqrt(np.asarray(weights, dtype=np.float64))[self.order]
+        return SpotBatch(
+            self.uv, self.whitening * root[:, None], self.R_base_hand, self.t_base_hand,
+            self.blocks, self.order,
+        )  # fmt: skip
+
+    def residuals(self, state: State) -> Array:
+        """Predicted minus seen pixel in input order, (N, 2); NaN where no spot can be."""
+        out = np.empty_like(self.uv)
+        out[self.order] = kernels.residuals(
+            self.uv, self.R_base_hand, self.t_base_hand, self.blocks, *state
+        )
+        return out
+
+    def rows(self, state: State) -> Array:
+        """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
+        out = np.empty((len(self), 2, kernels.COLUMNS))
+        out[self.order] = kernels.rows(
+            self.uv, self.whitening, self.R_base_hand, self.t_base_hand, self.blocks,
+            *state[:7], tangent_bases(state.plane_n), state.plane_d,
+        )  # fmt: skip
+        return out
+
+    def total_loss(self, state: State, loss: Loss) -> float:
+        """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
+        return float(
+            kernels.total_loss(
+                self.uv,
+                self.whitening,
+                self.R_base_hand,
+                self.t_base_hand,
+                self.blocks,
+                *state,
+                LOSSES[loss.name],
+                loss.threshold,
+            )  # fmt: skip
+        )
+
+    def information(self, state: State, offsets: Index, n: int, loss: Loss) -> Array:
+        """Augmented information (n+1, n+1), upper triangle."""
+        return np.asarray(
+            kernels.information(
+                self.uv,
+                self.whitening,
+                self.R_base_hand,
+                self.t_base_hand,
+                self.blocks,
+                offsets,
+                n,
+                *state[:7],
+                tangent_bases(state.plane_n),
+                state.plane_d,
+                LOSSES[loss.name],
+                loss.threshold,
+            )  # fmt: skip
+        )
+
+
+def LaserSpotFactor(
+    camera_key: int,
+    intrinsics_key: int,
+    laser_key: int,
+    plane_key: int,
+    uv: npt.ArrayLike,
+    T_base_hand: npt.ArrayLike,
+    frame: BeamFrame,
+    cov_uv: npt.ArrayLike,
+) -> gtsam.CustomFactor:
+    """One laser spot as a factor on camera pose, intrinsics, beam and plane (eq. 1-9, 55).
+
+    Parameters
+    ----------
+    camera_key, intrinsics_key, laser_key, plane_key : keys of a `Pose3`, a `Cal3DS2`, a 4-vector
+        (see ``frame``) and an `OrientedPlane3`
+    uv : (2,) seen pixel
+    T_base_hand : (4, 4) hand pose, metres
+    frame : constant `BeamFrame` about which the 4-vector is meant
+    cov_uv : (2, 2) px^2
+
+    Returns
+    -------
+    gtsam.CustomFactor
+        Error: whitened predicted minus seen pixel, (2,). Infinite where the beam misses the plane or
+        the spot lies behind the camera.
+
+    Raises
+    ------
+    FactorError
+        Wrong shapes; or, from inside a solver, linearised at a state where no spot can be.
+    """
+    keys = CellKeys(((camera_key, intrinsics_key),), (laser_key,), (plane_key,), (frame,))
+    batch = SpotBatch.from_arrays([uv], [cov_uv], [T_base_hand], [0], [0], [0])
+    w00, w01, w11 = batch.whitening[0]
+
+    def error(values: Any) -> Array:
+        du, dv = batch.residuals(keys.read(values))[0]
+        if math.isnan(du):
+            return np.full(2, np.inf)
+        return np.array([w00 * du + w01 * dv, w11 * dv])
+
+    def linearize(values: Any) -> tuple[Array, list[Array]]:
+        row = batch.rows(keys.read(values))[0]
+        return row[:, 22], [row[:, c] for c in keys.columns]
+
+    noise = gtsam.noiseModel.Unit.Create(2)
+    return custom_factor("LaserSpotFactor", noise, keys.keys, keys.dims, error, linearize)
+
+
+def LaserSpotBatchFactor(
+    keys: CellKeys,
+    batch: SpotBatch,
+    loss: Loss | None = None,
+    held: npt.ArrayLike | None = None,
+) -> gtsam.CustomFactor:
+    """All spots of a cell as one factor by square-root information.
+
+    Same error, gradient and Gauss-Newton Hessian as one `LaserSpotFactor` for each spot. The
+    Jacobian is the Cholesky factor of ``[J r]^T [J r]``, n+1 rows whatever the number of spots.
+
+    Parameters
+    ----------
+    keys : the variables; the batch's indices refer to them
+    batch : the spots
+    loss : robust loss for each spot (its derivative weights the spot)
+    held : (n,) booleans: tangent coordinates that must not move. They get a unit pin, so that the
+        rest is solved, and its covariance is, as if they were constants; their own marginal
+        covariance is then 1 and without meaning.
+
+    Raises
+    ------
+    FactorError
+        An index without a key; or, from inside a solver, linearised where no spot can be.
+    """
+    loss = loss or Loss()
+    limits = (len(keys.cameras), len(keys.lasers), len(keys.planes))
+    if np.any(batch.blocks[:, :3].max(axis=0) >= limits):
+        raise FactorError(f"batch: indices up to {batch.blocks[:, :3].max(axis=0)}, keys {limits}")
+    n = keys.n
+    compress = Compressor(keys, held)
+    noise = gtsam.noiseModel.Unit.Create(n + 1)
+    columns = keys.columns
+
+    def error(values: Any) -> Array:
+        e = np.zeros(n + 1)
+        e[0] = math.sqrt(batch.total_loss(keys.read(values), loss))
+        return e
+
+    def linearize(values: Any) -> tuple[Array, list[Array]]:
+        R = compress(batch, keys.read(values), loss)
+        return R[:, n], [R[:, c] for c in columns]
+
+    return custom_factor("LaserSpotBatchFactor", noise, keys.keys, keys.dims, error, linearize)
+
+
+class Compressor:
+    """Square-root information of a batch at a state, with held coordinates and tied focal lengths."""
+
+    def __init__(self, keys: CellKeys, held: npt.ArrayLike | None = None) -> None:
+        first = {key: c.start for key, c in zip(keys.keys, keys.columns, strict=True)}
+        self._camera = np.array([[first[x], first[k]] for x, k in keys.cameras], dtype=np.int64)
+        self._laser = np.array([first[x] for x in keys.lasers], dtype=np.int64)
+        self._plane = np.array([first[x] for x in keys.planes], dtype=np.int64)
+        self._n = keys.n
+        tied = [(c, a) for c, a in enumerate(keys.aspects) if a is not None]
+        self._ties = (
+            np.array([self._camera[c, 1] for c, _ in tied], dtype=np.int64),
+            np.array([self._camera[c, 1] + 1 for c, _ in tied], dtype=np.int64),
+            np.array([a for _, a in tied], dtype=np.float64),
+        )
+        self._held = np.zeros(keys.n, np.bool_) if held is None else np.array(held, np.bool_)
+        if self._held.shape != (keys.n,):
+            raise FactorError(f"held: expected ({keys.n},) booleans, got {self._held.shape}")
+        self._held[self._ties[0]] = True
+
+    def __call__(self, batch: SpotBatch, state: State, loss: Loss) -> Array:
+        """Upper triangular ``R`` (n+1, n+1) with ``R.T R = [J r]^T [J r]``; last column: residual.
+
+        Raises
+        ------
+        FactorError
+            A spot cannot be at this state (beam away from the plane, or behind the camera).
+        """
+        c, l, p = batch.blocks[:, :3].T  # noqa: E741
+        offsets = np.column_stack([self._camera[c], self._laser[l], self._plane[p]])
+        H = batch.information(state, offsets, self._n, loss)
+        if not math.isfinite(H[0, 0]):
+            raise FactorError(
+                "linearised where a beam misses its plane, a spot lies behind its camera, or the "
+                "distortion folds; check the start value"
+            )
+        kernels.constrain(H, self._held, *self._ties)
+        return np.asarray(kernels.cholesky(H))
+
+
+def tangent_bases(normals: Array) -> Array:
+    """(P, 3, 2) bases of the normals' tangent spaces, those of `gtsam.Unit3`."""
+    return np.array([kernels.tangent_basis(n) for n in normals])
+
+
+def whitening_from_covariance(cov: Array) -> Array:
+    """(N, 3) ``w00, w01, w11`` of upper triangular ``W`` with ``W.T W = inv(cov)``.
+
+    Raises
+    ------
+    FactorError
+        A covariance is not positive definite; names the first.
+    """
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    with np.errstate(all="ignore"):
+        det = a * c - b * b
+        w00 = np.sqrt(c / det)
+        out = np.column_stack([w00, -b / (det * w00), 1 / np.sqrt(c)])
+    bad = ~((det > 0) & (c > 0) & np.isfinite(out).all(axis=1))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise FactorError(f"cov_uv[{k}]: not positive definite: {cov[k].tolist()}")
+    return out
+
+
+def keys_for(cameras: int, lasers: int, planes: int, frames: Sequence[BeamFrame],
+             aspects: Sequence[float | None] = ()) -> CellKeys:  # fmt: skip
+    """Conventional keys: ``x`` camera pose, ``k`` intrinsics, ``l`` beam, ``p`` plane."""
+    return CellKeys(
+        tuple((gtsam.symbol("x", c), gtsam.symbol("k", c)) for c in range(cameras)),
+        tuple(gtsam.symbol("l", i) for i in range(lasers)),
+        tuple(gtsam.symbol("p", i) for i in range(planes)),
+        tuple(frames),
+        tuple(aspects),
+    )
