@@ -30,7 +30,6 @@ _EXPORTS = {
     "load_calibration": "io.calibration_file",
     "load_capture": "io.capture",
     "project": "projection",
-    "simulate": "simulate",
     "spot_on_beam": "projection",
     "spot_on_ray": "projection",
     "spot_triangulated": "projection",

@@ -89,6 +89,13 @@ DESIGNS = {
     "mid": _MID,
     "far": _FAR,
     "near-narrow": replace(_NEAR, cone=15 * RAD_PER_DEG, roll=15 * RAD_PER_DEG),
+    "table": MotionDesign(
+        beam_length=(100 * M_PER_MM, 250 * M_PER_MM),
+        longest=200 * M_PER_MM,
+        shortest=60 * M_PER_MM,
+        centre=0.6,
+        depth=(20 * M_PER_MM, 1500 * M_PER_MM),
+    ),
     "arbitrary": MotionDesign(centre=0.85),
 }
 
@@ -209,10 +216,8 @@ def _draw_starts(
 
     posture = rotation_from_zyx(0.0, 0.0, np.pi)
     roll = rng.uniform(-design.roll, design.roll, _BATCH)
-    R = rotation_exp(roll[:, None] * direction) @ _shortest_turns(
-        posture @ beam.direction_hand, direction
-    )
-    R = R @ posture
+    turn = _shortest_turns(posture @ beam.direction_hand, direction)
+    R = rotation_exp(roll[:, None] * direction) @ turn @ posture
     length = rng.uniform(*design.beam_length, _BATCH)
     t = spots - length[:, None] * direction - R @ beam.point_hand
     return R, t
@@ -237,7 +242,7 @@ def _draw_translations(
     prefer_back = rng.random((len(R), 3)) < 0.5
     found = spot_in_view(camera, beam, plane, R, t, design)
     offsets = np.zeros((len(R), shots, 3))
-    steps = int(np.floor(np.log(design.shortest / design.longest) / np.log(_SHRINK))) + 1
+    steps = int(np.log(design.shortest / design.longest) / np.log(_SHRINK) + 1e-9) + 1
     lengths = design.longest * _SHRINK ** np.arange(steps)
     row = 1
     for axis in range(3):

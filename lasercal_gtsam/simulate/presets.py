@@ -75,8 +75,22 @@ _PRESETS = (
     Preset(
         "table2-4", "Table 2, Test 4: 2 planes, 80 spots", _table2(2), 4, 10, "far", _TABLE2_TWO
     ),
-    Preset("tool-z", "beam along the tool's z axis, a horizontal table, 60 spots", _tool_z(1), 6),
-    Preset("tool-z-2", "beam along the tool's z axis, table and wedge, 60 spots", _tool_z(2), 3),
+    Preset(
+        "tool-z",
+        "beam along the tool's z axis, a horizontal table, 60 spots",
+        _tool_z(1),
+        6,
+        10,
+        "table",
+    ),
+    Preset(
+        "tool-z-2",
+        "beam along the tool's z axis, table and wedge, 60 spots",
+        _tool_z(2),
+        3,
+        10,
+        "table",
+    ),
     Preset(
         "no-groups",
         "paper's simulated cell, 2 planes, 60 arbitrary hand poses",
