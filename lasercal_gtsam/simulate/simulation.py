@@ -17,6 +17,7 @@ from lasercal_gtsam.projection import project
 from lasercal_gtsam.simulate.motions import MotionDesign, design_named, plan_motions
 from lasercal_gtsam.simulate.noise import Noise
 from lasercal_gtsam.simulate.presets import preset_named
+from lasercal_gtsam.simulate.streams import CELL, MOTIONS, NOISE, stream
 
 Index = npt.NDArray[np.int64]
 
@@ -92,7 +93,7 @@ def simulate(
     """
     chosen = preset_named(preset)
     made = simulate_cell(
-        chosen.cell(_streams(seed).cell),
+        chosen.cell(stream(seed, CELL)),
         groups=chosen.groups if groups is None else groups,
         shots=chosen.shots if shots is None else shots,
         seed=seed,
@@ -113,11 +114,12 @@ def simulate_cell(
     design: MotionDesign | str = "paper",
     camera: str | None = None,
     laser: str | None = None,
+    prefix: str = "s",
 ) -> Simulation:
     """Simulate any cell: one camera, one laser, some of its planes.
 
-    Captures of several cameras or lasers are made one after the other and joined with
-    ``a.observations + b.observations``.
+    Captures of several cameras or lasers are made one after the other, each with its own prefix,
+    and joined with ``a.observations + b.observations``.
 
     Parameters
     ----------
@@ -127,6 +129,7 @@ def simulate_cell(
     shots : poses per rotation; 1 gives arbitrary poses in no groups
     seed, noise, design : as in `simulate`
     camera, laser : names; may be left out where the cell has one
+    prefix : start of the spots' labels
 
     Raises
     ------
@@ -139,64 +142,37 @@ def simulate_cell(
     _check_request(cell, names, groups, shots)
     if isinstance(design, str):
         design = design_named(design)
-    streams = _streams(seed)
-    poses: list[Array] = []
-    plane: list[str] = []
-    group: list[int] = []
-    for name in names:
-        count = groups if isinstance(groups, int) else groups[name]
-        planned = plan_motions(
-            cell.cameras[camera],
-            cell.lasers[laser],
-            cell.planes[name],
-            count,
-            shots,
-            design,
-            streams.motions,
-        )
-        poses.append(planned.reshape(-1, 4, 4))
-        plane += [name] * (count * shots)
-        first = group[-1] + 1 if group else 0
-        group += [first + i for i in range(count) for _ in range(shots)]
-    T_base_hand = np.concatenate(poses)
-    seen = _take_shots(
-        cell, T_base_hand, np.array(plane), camera, laser, noise or Noise(), streams.noise
-    )
+    rng = stream(seed, MOTIONS)
+    view = cell.cameras[camera], cell.lasers[laser]
+    counts = [groups if isinstance(groups, int) else groups[name] for name in names]
+    planned = [
+        plan_motions(*view, cell.planes[name], count, shots, design, rng)
+        for name, count in zip(names, counts, strict=True)
+    ]
+    T_base_hand = np.concatenate(planned).reshape(-1, 4, 4)
+    plane = np.repeat(names, np.array(counts) * shots)
+    noise = Noise() if noise is None else noise
+    seen = _take_shots(cell, T_base_hand, plane, camera, laser, noise, stream(seed, NOISE))
     observations = Observations.from_arrays(
         seen.uv,
         T_base_hand,
-        plane=plane,
+        plane=plane.tolist(),
         image_size=cell.cameras[camera].image_size,
         camera=camera,
         laser=laser,
-        id=_labels(len(plane)),
+        id=_labels(prefix, len(plane)),
     )
     return Simulation(
         truth=cell,
         observations=observations,
-        noise=noise or Noise(),
+        noise=noise,
         known=_known(cell, names, camera),
         T_base_hand_actual=seen.T_base_hand_actual,
-        group=np.array(group),
+        group=np.repeat(np.arange(sum(counts)), shots),
         repeated=seen.repeated,
         preset="",
         seed=seed,
     )
-
-
-class _Streams(NamedTuple):
-    """Independent sources of draws, so that one use does not shift another."""
-
-    cell: np.random.Generator
-    motions: np.random.Generator
-    noise: np.random.Generator
-
-
-def _streams(seed: int) -> _Streams:
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
-        raise DataError(f"simulate: seed must be an integer >= 0, got {seed!r}")
-    children = np.random.SeedSequence(int(seed)).spawn(3)
-    return _Streams(*(np.random.default_rng(child) for child in children))
 
 
 class _Shots(NamedTuple):
@@ -246,10 +222,10 @@ def _known(cell: Cell, planes: Sequence[str], camera: str) -> dict[str, Any]:
     return {"principal_point": (intrinsics.u0, intrinsics.v0), "skew": intrinsics.skew}
 
 
-def _labels(count: int) -> list[str]:
-    """Labels that sort in order and that no spreadsheet takes for a number or a date."""
+def _labels(prefix: str, count: int) -> list[str]:
+    """Labels that sort in order; with a letter in front no spreadsheet takes them for numbers."""
     digits = max(3, len(str(count)))
-    return [f"s{k + 1:0{digits}d}" for k in range(count)]
+    return [f"{prefix}{k + 1:0{digits}d}" for k in range(count)]
 
 
 def _only(parts: Mapping[str, Any], name: str | None, kind: str) -> str:
