@@ -93,10 +93,33 @@ def project_points(points_base: Array, camera: Camera) -> Array:
     return pixel_from_normalized(distort(xy, camera.intrinsics), camera.intrinsics)
 
 
+def point_jacobian(points_base: Array, camera: Camera) -> Array:
+    """Derivative of `project_points` by the base point, (N, 2, 3) px/m."""
+    R, i = camera.T_base_camera[:3, :3], camera.intrinsics
+    p = (points_base - camera.T_base_camera[:3, 3]) @ R
+    z = p[:, 2]
+    x, y = p[:, 0] / z, p[:, 1] / z
+    r2 = x * x + y * y
+    g, dg = 1 + r2 * (i.k1 + i.k2 * r2), i.k1 + 2 * i.k2 * r2
+    a = g + 2 * x * x * dg + 2 * i.p1 * y + 6 * i.p2 * x
+    b = 2 * x * y * dg + 2 * i.p1 * x + 2 * i.p2 * y
+    c = g + 2 * y * y * dg + 6 * i.p1 * y + 2 * i.p2 * x
+    # pixel by (x, y)
+    D = np.stack(
+        [
+            np.stack([i.fu * a + i.skew * b, i.fu * b + i.skew * c], -1),
+            np.stack([i.fv * b, i.fv * c], -1),
+        ],
+        axis=1,
+    )
+    across = np.concatenate([D, -(D * np.stack([x, y], -1)[:, None]).sum(-1, keepdims=True)], -1)
+    return np.asarray(across / z[:, None, None] @ R.T)
+
+
 def ray_in_base(uv: Array, camera: Camera) -> Array:
     """Viewing rays in the base, ``R (x, y, 1)`` (10): (N, 3), not normalised; depth 1 along z."""
     xy = normalized_from_pixel(uv, camera.intrinsics)
-    rays = np.concatenate([xy, np.ones(xy.shape[:-1] + (1,))], axis=-1)
+    rays = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], axis=-1)
     return np.asarray(rays @ camera.T_base_camera[:3, :3].T)
 
 

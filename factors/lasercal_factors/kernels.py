@@ -7,7 +7,8 @@ depends on are the same for the whole block.
 Arrays of a batch
 -----------------
 uv (N, 2), R_base_hand (N, 3, 3), t_base_hand (N, 3)
-whitening (N, 3): ``w00, w01, w11`` of the upper triangle ``W`` with ``W.T @ W = inv(cov_uv)``
+whitening (N, 3): ``w00, w01, w11`` of the upper triangle ``W`` with ``W.T @ W = inv(cov_uv)``; all
+zero for a spot that is left out
 blocks (M, 5): camera, laser, plane index, first spot, one past the last spot
 
 Arrays of a state (C cameras, L lasers, P planes)
@@ -223,6 +224,8 @@ def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, ca
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
         for k in range(blocks[m, 3], blocks[m, 4]):
+            if whitening[k, 2] == 0.0:
+                continue
             ok, du, dv = _residual(
                 uv[k], R_base_hand[k], t_base_hand[k], u, q, plane_n[p], plane_d[p],
                 cam_R[c], cam_t[c], cam_K[c],
@@ -269,6 +272,8 @@ def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
         local[:] = 0.0
         for k in range(blocks[m, 3], blocks[m, 4]):
+            if whitening[k, 2] == 0.0:
+                continue
             ok = _row(
                 uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
                 plane_n[p], plane_B[p], plane_d[p], cam_R[c], cam_t[c], cam_K[c], J,

@@ -194,6 +194,19 @@ class SpotBatch:
             self.blocks, self.order,
         )  # fmt: skip
 
+    @cached_property
+    def used(self) -> npt.NDArray[np.bool_]:
+        """(N,) booleans in input order: spots with a weight above zero."""
+        out = np.empty(len(self), dtype=np.bool_)
+        out[self.order] = self.whitening[:, 2] > 0
+        return out
+
+    def whitened_lengths(self, state: State) -> Array:
+        """Length of each whitened residual in sigmas, input order, (N,); NaN where impossible."""
+        r, W = self.residuals(state), np.empty_like(self.whitening)
+        W[self.order] = self.whitening
+        return np.asarray(np.hypot(W[:, 0] * r[:, 0] + W[:, 1] * r[:, 1], W[:, 2] * r[:, 1]))
+
     def residuals(self, state: State) -> Array:
         """Predicted minus seen pixel in input order, (N, 2); NaN where no spot can be."""
         out = np.empty_like(self.uv)

@@ -1,0 +1,213 @@
+"""`calibrate`: observations in, calibration with sigmas out. No files, no printing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from lasercal_factors.spot import Loss, SpotBatch
+
+from lasercal_gtsam.calibration import (
+    Calibration,
+    Fit,
+    Inputs,
+    Observability,
+    SpotResults,
+    rms_px,
+)
+from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import make_batch
+from lasercal_gtsam.hand_noise import adjusted_batch
+from lasercal_gtsam.holds import resolve_holds
+from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.robust import reject_outliers
+from lasercal_gtsam.solve import Solution, fold_warnings
+from lasercal_gtsam.start import Search, refine_candidates, refine_given
+from lasercal_gtsam.uncertainty import Uncertainty, estimate_uncertainty, table_parameters
+
+_HAND_ROUNDS = 4
+
+
+def calibrate(
+    observations: Observations,
+    *,
+    initial: Cell | None = None,
+    options: CalibrationOptions | None = None,
+) -> Calibration:
+    """Estimate cameras, beams and planes of a cell, with their joint covariance.
+
+    Parameters
+    ----------
+    observations : Observations
+        Spots with their hand poses.
+    initial : Cell, optional
+        A start, for instance from drawings. Left out, the start comes from the data alone by the
+        paper's closed form (sections 3.2, 3.3).
+    options : CalibrationOptions, optional
+
+    Returns
+    -------
+    Calibration
+        ``fit.converged`` is False, and ``fit.status`` says why, where a check was not passed.
+
+    Raises
+    ------
+    DataError
+        The input is inconsistent (names, options).
+    DegenerateError
+        The data cannot determine what was asked; names what is missing.
+    SolveError
+        No start could be refined.
+    """
+    options = options or CalibrationOptions()
+    _check_supported(options)
+    holds = resolve_holds(observations, options, initial)
+    batch = make_batch(observations, options.sigma_px)
+    search = Search(observations, batch, holds, options, Loss())
+    if initial is None:
+        from lasercal_gtsam.closed_form import closed_form_candidates
+
+        candidates = closed_form_candidates(
+            observations,
+            principal_point={
+                name: (known["u0"], known["v0"])
+                for name, known in holds.known.items()
+                if {"u0", "v0"} <= set(known)
+            },
+        )
+        start = holds.apply(candidates[0].cell)
+        solution = refine_candidates(search, candidates)
+    else:
+        start = initial
+        solution = refine_given(search, initial)
+    if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
+        search, solution = _with_hand_noise(search, solution)
+    reasons: tuple[str | None, ...] = (None,) * len(observations)
+    if options.robust == "auto":
+        search, solution, reasons = reject_outliers(search, solution)
+    return assemble(observations, options, start, solution, batch, reasons)
+
+
+def assemble(
+    observations: Observations,
+    options: CalibrationOptions,
+    start: Cell,
+    solution: Solution,
+    batch: SpotBatch,
+    reasons: tuple[str | None, ...],
+) -> Calibration:
+    """Sigmas, table, spots and the status sentence of a solution.
+
+    ``batch`` holds the spots as observed (commanded hand poses): the residuals refer to them.
+    """
+    uncertainty = estimate_uncertainty(solution)
+    problem = solution.problem
+    cell = _in_order(solution.cell, start)
+    residuals = batch.residuals(problem.keys.read(problem.values(solution.cell)))
+    used = np.array([reason is None for reason in reasons])
+    warnings = fold_warnings(solution.cell)
+    fit = _fit(solution, uncertainty, residuals[used], int((~used).sum()), warnings)
+    return Calibration(
+        cell=cell,
+        initial=start,
+        parameters=table_parameters(
+            solution.cell, _restricted(start, solution.cell), uncertainty, problem
+        ),
+        covariance=uncertainty.covariance,
+        labels=uncertainty.labels,
+        fit=fit,
+        spots=SpotResults(
+            observations.id,
+            observations.plane,
+            observations.camera,
+            observations.laser,
+            residuals,
+            used.astype(np.float64),
+            reasons,
+        ),  # fmt: skip
+        observability=Observability(uncertainty.weak, problem.holds.words, tuple(warnings)),
+        inputs=Inputs(observations, options),
+    )
+
+
+def _fit(
+    solution: Solution,
+    uncertainty: Uncertainty,
+    residuals: Array,
+    n_rejected: int,
+    warnings: list[str],
+) -> Fit:
+    rms = rms_px(residuals)
+    if solution.troubles:
+        status = "not to be trusted: " + "; ".join(solution.troubles)
+    else:
+        status = f"converged in {solution.iterations} iterations: {len(residuals)} spots, RMS {rms:.3g} px"
+        if n_rejected:
+            status += f", {n_rejected} rejected as outliers"
+        if uncertainty.dof < 1:
+            status += "; no degrees of freedom left, so no sigmas: add spots"
+        if warnings:
+            status += "; but " + "; ".join(warnings)
+    return Fit(
+        rms_px=rms,
+        sigma0=uncertainty.sigma0,
+        dof=uncertainty.dof,
+        iterations=solution.iterations,
+        converged=not solution.troubles,
+        status=status,
+        n_spots=len(residuals),
+        n_rejected=n_rejected,
+    )
+
+
+def _with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Solution]:
+    """Refit with the robot's noise: a few rounds of corrected hand poses (`hand_noise`)."""
+    observations, options = search.observations, search.options
+    unknown = np.isnan(observations.cov_uv[:, 0, 0])
+    own = (options.sigma_px or 1.0) ** 2 * np.eye(2)
+    cov = np.where(unknown[:, None, None], own, observations.cov_uv)
+    eta = np.zeros((len(observations), 6))
+    for _ in range(_HAND_ROUNDS):
+        batch, eta = adjusted_batch(
+            observations, cov, solution.cell, options.hand_sigma_m, options.hand_sigma_rad, eta
+        )
+        search = replace(search, batch=batch)
+        better = search.solve_from(solution.cell, solution.problem.holds)
+        if better is None:
+            break
+        solution = better
+    return search, solution
+
+
+def _restricted(cell: Cell, like: Cell) -> Cell:
+    """The parts of ``cell`` that ``like`` has, in its order."""
+    return Cell(
+        {name: cell.cameras[name] for name in like.cameras},
+        {name: cell.lasers[name] for name in like.lasers},
+        {name: cell.planes[name] for name in like.planes},
+    )
+
+
+def _in_order(estimate: Cell, start: Cell) -> Cell:
+    """The estimate, and the start's parts that nothing was observed of, unchanged."""
+    return Cell(
+        estimate.cameras | {k: v for k, v in start.cameras.items() if k not in estimate.cameras},
+        estimate.lasers | {k: v for k, v in start.lasers.items() if k not in estimate.lasers},
+        estimate.planes | {k: v for k, v in start.planes.items() if k not in estimate.planes},
+    )
+
+
+def _check_supported(options: CalibrationOptions) -> None:
+    if options.robust not in ("auto", "none"):
+        raise DataError(
+            f"options.robust: {options.robust!r} is not available yet; use 'auto' (outliers are found, "
+            "named and left out) or 'none'"
+        )
+    if options.distortion == "auto":
+        raise DataError(
+            "options.distortion: 'auto' is not available yet; use 'all', 'none' or names out of "
+            "k1, k2, p1, p2"
+        )

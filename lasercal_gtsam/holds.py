@@ -1,0 +1,269 @@
+"""Which unknowns are held, known, tied or weakly prior-ed, resolved from the options.
+
+Everything here is words and booleans over the tangent coordinates of `report_map`; no solving.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from lasercal_gtsam.cell import INTRINSIC_NAMES, Camera, Cell, Intrinsics
+from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import DISTORTION_NAMES, CalibrationOptions
+from lasercal_gtsam.report_map import BEAM_TANGENT, CAMERA_TANGENT, PLANE_TANGENT, BeamChart
+from lasercal_gtsam.report_map import row_names as table_rows
+
+# method 6.2: what one plane is told when nobody says more (units of the table rows)
+ONE_PLANE_PRIORS: dict[str, tuple[float, float]] = {
+    "aspect": (1.0, 0.01),
+    "k1": (0.0, 1.0),
+    "k2": (0.0, 3.0),
+    "p1": (0.0, 0.03),
+    "p2": (0.0, 0.03),
+}
+
+
+@dataclass(frozen=True)
+class Holds:
+    """What is not free.
+
+    Attributes
+    ----------
+    held : (n,) booleans over the tangent coordinates: kept at the start's value
+    known : camera -> intrinsic name -> value that replaces the start's
+    aspect : camera -> fu / fv, where tied
+    priors : name -> (mean, sigma) in table units; names prefixed as in the table
+    words : one sentence for each, for the report
+    """
+
+    held: npt.NDArray[np.bool_]
+    known: dict[str, dict[str, float]]
+    aspect: dict[str, float]
+    priors: dict[str, tuple[float, float]]
+    words: tuple[str, ...]
+
+    def apply(self, cell: Cell) -> Cell:
+        """Put the known values (and tied focal lengths) into a start."""
+        cameras: dict[str, Camera] = {}
+        for name, camera in cell.cameras.items():
+            values = dict(zip(INTRINSIC_NAMES, camera.intrinsics.vector, strict=True))
+            values |= self.known.get(name, {})
+            if name in self.aspect:
+                if "fu" in self.known.get(name, {}):
+                    values["fv"] = values["fu"] / self.aspect[name]
+                values["fu"] = self.aspect[name] * values["fv"]
+            intrinsics = Intrinsics(**{k: float(v) for k, v in values.items()})
+            cameras[name] = Camera(intrinsics, camera.T_base_camera, camera.image_size)
+        return Cell(cameras, cell.lasers, cell.planes)
+
+    def without_distortion(self, keep: tuple[str, ...] = ()) -> Holds:
+        """Hold the distortion terms too, except those named (for staged starts, method 6.2)."""
+        held = self.held.copy()
+        for c in range(len(self.known)):
+            for term in DISTORTION_NAMES:
+                if term not in keep:
+                    held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(term)] = True
+        return Holds(held, self.known, self.aspect, self.priors, self.words)
+
+
+def resolve_holds(
+    observations: Observations, options: CalibrationOptions, initial: Cell | None = None
+) -> Holds:
+    """Turn the options into masks and values for the parts that were observed.
+
+    One plane seen by a camera: its skew and its principal point are held and weak priors are set, as
+    in the paper's section 3.3. The principal point is the known one, or that of a given ``initial``
+    cell, or the image centre (half width, half height).
+
+    Raises
+    ------
+    DataError
+        A name in ``known``, ``fixed``, ``priors`` or ``distortion`` does not exist; lists them.
+    """
+    builder = _Builder(observations)
+    builder.distortion(options.distortion)
+    for key, value in options.known.items():
+        builder.known_value(key, value)
+    for key in options.fixed:
+        builder.fix(key)
+    builder.one_plane(options, initial)
+    builder.user_priors(options.priors)
+    return Holds(builder.held, builder.known, builder.aspect, builder.priors, tuple(builder.words))
+
+
+class _Builder:
+    def __init__(self, observations: Observations) -> None:
+        self.observations = observations
+        self.cameras, self.lasers = observations.cameras, observations.lasers
+        self.planes = observations.planes
+        n_camera, n_laser = len(self.cameras), len(self.lasers)
+        self.first_laser = n_camera * len(CAMERA_TANGENT)
+        self.first_plane = self.first_laser + n_laser * len(BEAM_TANGENT)
+        size = self.first_plane + len(self.planes) * len(PLANE_TANGENT)
+        self.held = np.zeros(size, dtype=np.bool_)
+        self.known: dict[str, dict[str, float]] = {c: {} for c in self.cameras}
+        self.aspect: dict[str, float] = {}
+        self.priors: dict[str, tuple[float, float]] = {}
+        self.words: list[str] = []
+
+    def hold(self, camera: str, *names: str) -> None:
+        first = self.cameras.index(camera) * len(CAMERA_TANGENT)
+        for name in names:
+            self.held[first + CAMERA_TANGENT.index(name)] = True
+
+    def distortion(self, wanted: str | tuple[str, ...]) -> None:
+        if wanted == "all":
+            return
+        keep: tuple[str, ...] = () if isinstance(wanted, str) else tuple(wanted)
+        held = [term for term in DISTORTION_NAMES if term not in keep]
+        for camera in self.cameras:
+            self.hold(camera, *held)
+        if held:
+            self.words.append(
+                f"{', '.join(held)} held at the start's value (distortion={wanted!r})"
+            )
+
+    def split(self, key: str, option: str) -> tuple[tuple[str, ...], str]:
+        """Cameras meant by ``name`` or ``<camera>.name``, and the name."""
+        camera, dot, name = key.rpartition(".")
+        if not dot:
+            return self.cameras, key
+        if camera not in self.cameras:
+            raise DataError(
+                f"options.{option}: {key!r} names the camera {camera!r}; observed: {self.cameras}"
+            )
+        return (camera,), name
+
+    def known_value(self, key: str, value: Any) -> None:
+        cameras, name = self.split(key, "known")
+        for camera in cameras:
+            for term, number in _known_terms(name, value).items():
+                if term == "aspect":
+                    self.aspect[camera] = number
+                else:
+                    self.known[camera][term] = number
+                    self.hold(camera, term)
+        self.words.append(f"{key} held at the known value {value}")
+
+    def fix(self, key: str) -> None:
+        kind, colon, name = key.partition(":")
+        if colon:
+            groups = {"camera": self.cameras, "laser": self.lasers, "plane": self.planes}
+            if kind not in groups or name not in groups[kind]:
+                raise DataError(
+                    f"options.fixed: {key!r} is no part that was observed; there are "
+                    + ", ".join(f"{k}:{n}" for k, names in groups.items() for n in names)
+                )
+            i = groups[kind].index(name)
+            first, size = {
+                "camera": (i * len(CAMERA_TANGENT), len(CAMERA_TANGENT)),
+                "laser": (self.first_laser + i * len(BEAM_TANGENT), len(BEAM_TANGENT)),
+                "plane": (self.first_plane + i * len(PLANE_TANGENT), len(PLANE_TANGENT)),
+            }[kind]
+            self.held[first : first + size] = True
+        else:
+            cameras, name = self.split(key, "fixed")
+            groups_of = {
+                "intrinsics": INTRINSIC_NAMES,
+                "T_base_camera": CAMERA_TANGENT[:6],
+                "distortion": DISTORTION_NAMES,
+                "principal_point": ("u0", "v0"),
+                "alpha_c": ("skew",),
+            }
+            names = groups_of.get(name, (name,))
+            if names[0] not in CAMERA_TANGENT or (names == (name,) and name not in INTRINSIC_NAMES):
+                raise DataError(
+                    f"options.fixed: unknown name {key!r}; allowed: "
+                    + ", ".join([*INTRINSIC_NAMES, *groups_of])
+                    + ", camera:<name>, laser:<name>, plane:<name>"
+                )
+            for camera in cameras:
+                self.hold(camera, *names)
+        self.words.append(f"{key} held at the start's value (fixed)")
+
+    def one_plane(self, options: CalibrationOptions, initial: Cell | None) -> None:
+        """Assumptions of the paper's section 3.3 for every camera that sees one plane only."""
+        index = self.observations
+        for c, camera in enumerate(self.cameras):
+            if len(np.unique(index.plane_index[index.camera_index == c])) > 1:
+                continue
+            first = c * len(CAMERA_TANGENT)
+            width, height = index.image_size[camera]
+            free = {t: not self.held[first + CAMERA_TANGENT.index(t)] for t in INTRINSIC_NAMES}
+            fixed: list[str] = []
+            values = {"u0": width / 2, "v0": height / 2, "skew": 0.0}
+            if initial is not None and camera in initial.cameras:
+                values = {t: getattr(initial.cameras[camera].intrinsics, t) for t in values}
+            for term, value in values.items():
+                if free[term]:
+                    self.known[camera][term] = value
+                    self.hold(camera, term)
+                    fixed.append(f"{term} = {value:g}")
+            if fixed:
+                self.words.append(
+                    f"camera {camera!r} sees one plane only: {', '.join(fixed)} assumed and held"
+                )
+            weak: list[str] = []
+            for term, (mean, sigma) in ONE_PLANE_PRIORS.items():
+                name = self.prefix(camera) + term
+                if term == "aspect":
+                    wanted = camera not in self.aspect and free["fu"] and free["fv"]
+                else:
+                    wanted = free[term]
+                if wanted and name not in options.priors and term not in options.priors:
+                    self.priors[name] = (mean, sigma)
+                    weak.append(f"{term.replace('aspect', 'fu/fv')} {mean:g} +- {sigma:g}")
+            if weak:
+                self.words.append(
+                    f"camera {camera!r} sees one plane only: weak priors {', '.join(weak)}"
+                )
+
+    def prefix(self, camera: str) -> str:
+        return f"{camera}." if len(self.cameras) > 1 else ""
+
+    def user_priors(self, priors: Mapping[str, tuple[float, float]]) -> None:
+        for name, pair in priors.items():
+            try:
+                mean, sigma = (float(x) for x in pair)
+            except (TypeError, ValueError):
+                raise DataError(
+                    f"options.priors[{name!r}]: expected (mean, sigma), got {pair!r}"
+                ) from None
+            if not (np.isfinite(mean) and 0 < sigma < np.inf):
+                raise DataError(f"options.priors[{name!r}]: sigma must be positive, got {sigma}")
+            self.priors[name] = (mean, sigma)
+            self.words.append(f"prior {name} = {mean:g} +- {sigma:g}")
+
+
+def check_prior_names(holds: Holds, cell: Cell, charts: dict[str, BeamChart]) -> None:
+    """Raise `DataError` where a prior names no row of the table."""
+    rows = [name for name, _ in table_rows(cell, charts)]
+    rows += [f"{c}.aspect" for c in cell.cameras] if len(cell.cameras) > 1 else ["aspect"]
+    for name in holds.priors:
+        if name not in rows:
+            raise DataError(f"options.priors: unknown name {name!r}; allowed: {', '.join(rows)}")
+
+
+def _known_terms(name: str, value: Any) -> dict[str, float]:
+    try:
+        if name == "principal_point":
+            u0, v0 = value
+            return {"u0": float(u0), "v0": float(v0)}
+        if name in ("aspect", *INTRINSIC_NAMES):
+            number = float(value)
+            if name in ("aspect", "fu", "fv") and not number > 0:
+                raise DataError(f"options.known: {name} must be positive, got {value!r}")
+            return {name: number}
+    except (TypeError, ValueError):
+        wanted = "(u0, v0)" if name == "principal_point" else "a number"
+        raise DataError(f"options.known: {name} must be {wanted}, got {value!r}") from None
+    raise DataError(
+        f"options.known: unknown name {name!r}; allowed: principal_point, aspect, "
+        + ", ".join(INTRINSIC_NAMES)
+    )

@@ -1,0 +1,284 @@
+"""Levenberg-Marquardt on the cell's graph, and the checks that turn its end into an answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from lasercal_gtsam.cell import Cell, Intrinsics
+from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import CellGraph
+from lasercal_gtsam.observability import SINGULAR, weak_directions
+from lasercal_gtsam.report_map import tangent_labels
+
+# Newton decrement (distance to the optimum in sigmas) at which a solution counts as reached
+CONVERGED_SIGMAS = 1e-3
+_POLISHED_SIGMAS = 1e-7
+_MAX_POLISH = 6
+# residual scale below which data are exact to rounding and sigmas have no meaning (px)
+_ROUNDING_PX = 1e-9
+_MAX_SCALE_ROUNDS = 12
+_MIN_SCALE = 1e-7
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where the optimiser ended.
+
+    Attributes
+    ----------
+    problem : the graph it was solved on (with its final ``scale``)
+    cell : the estimate
+    cost : sum of the squared whitened residuals (robust: of the losses) at ``scale`` 1, without
+        priors
+    total_cost : the same with the priors, in units of the final scale
+    iterations : Levenberg-Marquardt iterations in all
+    decrement : distance to the optimum in sigmas by one more Newton step
+    troubles : sentences; empty if every check passed
+    """
+
+    problem: CellGraph
+    cell: Cell
+    cost: float
+    total_cost: float
+    iterations: int
+    decrement: float
+    troubles: tuple[str, ...]
+
+    @property
+    def plausible(self) -> bool:
+        """Whether every check passed."""
+        return not self.troubles
+
+
+def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True) -> Solution:
+    """Minimise from the problem's start.
+
+    Where priors are set, their weight against the data follows from the residual scale, so that the
+    scale is found along with the unknowns (unless ``find_scale`` is False: the problem's is kept).
+
+    Raises
+    ------
+    SolveError
+        The start itself is impossible (a beam misses its plane, a spot behind the camera, ...).
+    """
+    values = problem.values()
+    if not np.isfinite(problem.graph.error(values)):
+        raise SolveError(
+            "the start is impossible: " + (_impossible(problem, problem.start) or "not finite")
+        )
+    iterations, decrement = 0, np.inf
+    search = find_scale and bool(problem.holds.priors)
+    for _ in range(_MAX_SCALE_ROUNDS if search else 1):
+        values, used = _optimise(problem, values, max_iterations)
+        iterations += used
+        values, decrement = _polish(problem, values)
+        if not search:
+            break
+        scale = max(_data_scale(problem, values), _MIN_SCALE)
+        if abs(np.log(scale / problem.scale)) < 0.005:
+            break
+        problem = problem.rescaled(scale)
+    cell = problem.cell(values)
+    state = problem.keys.read(values)
+    cost = problem.batch.total_loss(state, problem.loss)
+    total = 2.0 * float(problem.graph.error(values))
+    troubles = _troubles(problem, cell, cost, iterations, decrement, max_iterations)
+    return Solution(problem, cell, cost, total, iterations, decrement, troubles)
+
+
+def degrees_of_freedom(problem: CellGraph, values: gtsam.Values) -> float:
+    """Residuals minus the unknowns that the data (not the priors) determine."""
+    rows = 2.0 * float(problem.batch.used.sum())
+    free = int(free_columns(problem).sum())
+    if not problem.holds.priors:
+        return rows - free
+    A = problem.graph.linearize(values).jacobian(natural_order(problem))[0]
+    A = A[:, free_columns(problem)]
+    m = len(problem.holds.priors)
+    data = A[: len(A) - m]
+    information = A.T @ A
+    share = np.trace(np.linalg.lstsq(information, data.T @ data, rcond=None)[0])
+    return rows - float(share)
+
+
+def free_columns(problem: CellGraph) -> Array:
+    """(n,) booleans: tangent coordinates that are estimated (tied focal lengths: ``fv`` is)."""
+    free = ~problem.holds.held
+    for c, aspect in enumerate(problem.keys.aspects):
+        if aspect is not None:
+            free[problem.keys.columns[2 * c + 1].start] = False
+    return np.asarray(free)
+
+
+def natural_order(problem: CellGraph) -> gtsam.Ordering:
+    """Elimination order in the column order of the keys."""
+    ordering = gtsam.Ordering()
+    for key in problem.keys.keys:
+        ordering.push_back(key)
+    return ordering
+
+
+def square_root_information(problem: CellGraph, values: gtsam.Values) -> Array:
+    """Rows of the whole graph (spots and priors) at the values, columns in key order, (m, n)."""
+    return np.asarray(problem.graph.linearize(values).jacobian(natural_order(problem))[0])
+
+
+def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> None:
+    """Raise `DegenerateError` naming the directions that the data do not determine at all."""
+    R = square_root_information(problem, values)
+    labels = tangent_labels(problem.start)
+    weak = weak_directions(R, labels, free_columns(problem), SINGULAR)
+    if weak:
+        raise DegenerateError(
+            f"the spots leave {len(weak)} combination(s) of unknowns undetermined: "
+            + "; ".join(f"({i + 1}) {w.words}" for i, w in enumerate(weak))
+            + ". Add hand orientations (at least three, not about one axis), longer translations or "
+            "a tilted plane, or hold what is known"
+        )
+
+
+def _optimise(
+    problem: CellGraph, values: gtsam.Values, max_iterations: int
+) -> tuple[gtsam.Values, int]:
+    params = gtsam.LevenbergMarquardtParams()
+    params.setMaxIterations(max_iterations)
+    params.setRelativeErrorTol(1e-10)
+    params.setAbsoluteErrorTol(1e-18)
+    optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, params)
+    result = optimizer.optimize()
+    return result, int(optimizer.iterations())
+
+
+def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
+    """Undamped Newton steps while they lower the error; the last step's length in sigmas."""
+    error = problem.graph.error(values)
+    decrement = np.inf
+    for _ in range(_MAX_POLISH):
+        linear = problem.graph.linearize(values)
+        try:
+            step = linear.optimize()
+        except RuntimeError:
+            refuse_if_singular(problem, values)
+            return values, np.inf
+        decrement = float(np.sqrt(max(0.0, -step.dot(linear.gradientAtZero()))))
+        if decrement < _POLISHED_SIGMAS * max(1.0, np.sqrt(2 * error)):
+            break
+        moved = values.retract(step)
+        new_error = problem.graph.error(moved)
+        if not new_error < error:
+            break
+        values, error = moved, new_error
+    return values, decrement
+
+
+def _data_scale(problem: CellGraph, values: gtsam.Values) -> float:
+    cost = problem.batch.total_loss(problem.keys.read(values), problem.loss)
+    return float(np.sqrt(cost / max(degrees_of_freedom(problem, values), 1.0)))
+
+
+def _troubles(
+    problem: CellGraph,
+    cell: Cell,
+    cost: float,
+    iterations: int,
+    decrement: float,
+    max_iterations: int,
+) -> tuple[str, ...]:
+    found: list[str] = []
+    if not np.isfinite(cost):
+        found.append("the error is not finite")
+    rows = 2 * int(problem.batch.used.sum())
+    sigma = max(np.sqrt(cost / rows), _ROUNDING_PX) / problem.scale
+    if not decrement < CONVERGED_SIGMAS * sigma:
+        limit = f" (limit {max_iterations})" if iterations >= max_iterations else ""
+        found.append(
+            f"not converged: one more step would move {decrement / sigma:.2g} sigma after "
+            f"{iterations} iterations{limit}"
+        )
+    impossible = _impossible(problem, cell)
+    if impossible:
+        found.append(impossible)
+    found += implausible_cameras(problem, cell)
+    return tuple(found)
+
+
+def _impossible(problem: CellGraph, cell: Cell) -> str | None:
+    try:
+        bad = np.isnan(problem.residuals(cell)[:, 0]) & problem.batch.used
+    except LasercalError as error:
+        return str(error)
+    if not bad.any():
+        return None
+    return (
+        f"{int(bad.sum())} of {len(bad)} spots cannot be (beam away from its plane, behind the camera, "
+        f"or in the fold of the distortion); first: spot number {int(np.argmax(bad))}"
+    )
+
+
+def implausible_cameras(problem: CellGraph, cell: Cell) -> list[str]:
+    """What no real camera does (method 6.2): focal length far off, or distortion that folds.
+
+    The distortion folds where the distorted radius stops growing. Inside the region of the spots
+    (10 % margin) that is no answer; `fold_warnings` names folds between the spots and the corners.
+    """
+    found: list[str] = []
+    for c, (name, camera) in enumerate(cell.cameras.items()):
+        width = camera.image_size[0]
+        for f_name in ("fu", "fv"):
+            f = getattr(camera.intrinsics, f_name)
+            if not 0.1 * width < f < 50 * width:
+                found.append(
+                    f"camera {name!r}: {f_name} = {f:.4g} px is outside 0.1 to 50 image widths"
+                )
+        fold = fold_radius(camera.intrinsics)
+        if fold < 1.1 * float(_radii(problem.spot_pixels(c), camera.intrinsics).max()):
+            found.append(
+                f"camera {name!r}: {_fold_words(camera.intrinsics, fold)} inside the spots"
+            )
+    return found
+
+
+def fold_warnings(cell: Cell) -> list[str]:
+    """Cameras whose distortion folds before the farthest image corner: not to be used out there."""
+    found: list[str] = []
+    for name, camera in cell.cameras.items():
+        fold = fold_radius(camera.intrinsics)
+        width, height = camera.image_size
+        corners = np.array([[x, y] for x in (0.0, width - 1) for y in (0.0, height - 1)])
+        if fold < float(_radii(corners, camera.intrinsics).max()):
+            found.append(
+                f"camera {name!r}: {_fold_words(camera.intrinsics, fold)} inside the image but "
+                "beyond the spots: do not use the model out there, or take spots there, or hold k2"
+            )
+    return found
+
+
+def fold_radius(intrinsics: Intrinsics) -> float:
+    """Largest distorted radius (normalised) before the radial distortion turns back; inf if never.
+
+    The slope ``1 + 3 k1 r^2 + 5 k2 r^4`` first vanishes there.
+    """
+    k1, k2 = intrinsics.k1, intrinsics.k2
+    roots = np.roots([5 * k2, 3 * k1, 1.0])
+    positive = [float(r.real) for r in roots if abs(r.imag) == 0 and r.real > 0]
+    if not positive:
+        return float("inf")
+    r2 = min(positive)
+    return float(np.sqrt(r2) * (1 + k1 * r2 + k2 * r2 * r2))
+
+
+def _radii(uv: Array, i: Intrinsics) -> Array:
+    """Distorted normalised radii of pixels, (N,)."""
+    y = (uv[:, 1] - i.v0) / i.fv
+    return np.asarray(np.hypot((uv[:, 0] - i.u0 - i.skew * y) / i.fu, y))
+
+
+def _fold_words(i: Intrinsics, fold: float) -> str:
+    return (
+        f"the distortion (k1 {i.k1:.3g}, k2 {i.k2:.3g}) folds {fold * i.fu:.0f} px from the principal "
+        "point,"
+    )

@@ -1,0 +1,284 @@
+"""From closed-form candidates to the optimum: staged refinement and restarts (method 6.2, 6.3).
+
+Deterministic: the same observations and options give the same path and the same answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from lasercal_factors.spot import Loss, SpotBatch
+
+from lasercal_gtsam.cell import Camera, Cell, Intrinsics
+from lasercal_gtsam.closed_form import Candidate
+from lasercal_gtsam.errors import DataError, LasercalError, SolveError
+from lasercal_gtsam.graph import CellGraph, make_graph
+from lasercal_gtsam.holds import Holds
+from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import DISTORTION_NAMES, CalibrationOptions
+from lasercal_gtsam.report_map import CAMERA_TANGENT
+from lasercal_gtsam.solve import (
+    Solution,
+    fold_warnings,
+    free_columns,
+    solve,
+    square_root_information,
+)
+
+# method 6.3: how many candidates are refined shortly, and how many different ones fully
+_SHORT_LIST = 6
+_FULL_LIST = 3
+_SHORT_ITERATIONS = 40
+# a candidate with fewer possible spots than this is not refined
+_MIN_POSSIBLE = 0.8
+# two costs closer than this (relative) are the same minimum
+_SAME_COST = 1e-3
+# a fold-free minimum is preferred to a folding one if it costs at most this many chi-square more
+_FOLD_CHI2 = 9.0
+# residual level (px) at which the weak priors of the staged start are weighed
+_STAGE_SIGMA_PX = 3.0
+_RESTART_STEPS = (0.03, -0.03, 0.1, -0.1)
+# k2 restarts are skipped where they would begin more than this many sigmas away
+_RESTART_SIGMAS = 10.0
+
+
+@dataclass(frozen=True)
+class Search:
+    """What every refinement needs."""
+
+    observations: Observations
+    batch: SpotBatch
+    holds: Holds
+    options: CalibrationOptions
+    loss: Loss
+
+    def solve_from(self, cell: Cell, holds: Holds | None = None) -> Solution | None:
+        """Full refinement; None where the start is impossible or the path leaves the model."""
+        try:
+            problem = make_graph(
+                self.observations, self.batch, holds or self.holds, cell, self.loss
+            )
+            return solve(problem, self.options.max_iterations)
+        except DataError:
+            raise
+        except LasercalError:
+            return None
+
+
+def refine_given(search: Search, initial: Cell) -> Solution:
+    """Refine a start given by the user; staged from there only if the direct way fails.
+
+    Raises
+    ------
+    SolveError
+        The start is impossible and no staged way leads out of it.
+    DataError
+        A part is missing in ``initial``.
+    """
+    direct = search.solve_from(initial)
+    if direct is not None and direct.plausible:
+        return direct
+    candidate = Candidate(initial, float("nan"), "given", 0.0)
+    try:
+        return refine_candidates(search, [candidate], direct)
+    except SolveError:
+        # report why the start itself is impossible
+        return solve(
+            make_graph(search.observations, search.batch, search.holds, initial, search.loss),
+            search.options.max_iterations,
+        )
+
+
+def refine_candidates(
+    search: Search, candidates: Sequence[Candidate], also: Solution | None = None
+) -> Solution:
+    """Best solution over the candidates (method 6.3 steps 3-5).
+
+    Raises
+    ------
+    SolveError
+        No candidate could be refined at all.
+    """
+    staged = _short_refinements(search, candidates)
+    full: list[Solution] = [also] if also is not None else []
+    for cell in staged:
+        solution = search.solve_from(cell)
+        if solution is None:
+            continue
+        again = any(_same_cost(solution, other) for other in full if other.plausible)
+        full.append(solution)
+        if (again and solution.plausible) or len(full) >= _FULL_LIST:
+            break
+    if not full:
+        raise SolveError(
+            "no start could be refined: every closed-form candidate leaves spots behind the camera or "
+            "beams that miss their plane. Check the pose convention and units, the plane names, and "
+            "that laser and camera look at the same plane"
+        )
+    best = best_of(full)
+    best = best_of([best, *_k2_restarts(search, best)])
+    if not best.plausible:
+        best = best_of([best, *_fewer_distortion_terms(search, best, staged)])
+    return best
+
+
+def best_of(solutions: Iterable[Solution]) -> Solution:
+    """Plausible before implausible, then the lowest cost; a fold-free model is preferred to one that
+    folds beyond the spots where the data do not speak against it."""
+    ranked = sorted(solutions, key=lambda s: (len(s.troubles) > 0, s.cost))
+    best = ranked[0]
+    if fold_warnings(best.cell):
+        noise = best.cost / max(2 * best.problem.batch.used.sum() - best.problem.keys.n, 1)
+        for other in ranked[1:]:
+            close = other.cost <= best.cost + _FOLD_CHI2 * noise
+            if close and other.plausible == best.plausible and not fold_warnings(other.cell):
+                return other
+    return best
+
+
+def fits_distortion(holds: Holds, cameras: int) -> bool:
+    """Whether any distortion term of any camera is estimated."""
+    size = len(CAMERA_TANGENT)
+    columns = [c * size + CAMERA_TANGENT.index(t) for c in range(cameras) for t in DISTORTION_NAMES]
+    return not bool(holds.held[columns].all())
+
+
+def _short_refinements(search: Search, candidates: Sequence[Candidate]) -> list[Cell]:
+    """Stages (a) without distortion and (b) with k1, weak priors; cheapest first, doubles dropped."""
+    with_distortion = fits_distortion(search.holds, len(search.observations.cameras))
+    priors = _stage_priors(search)
+    stages = [replace(search.holds.without_distortion(), priors=priors)]
+    if with_distortion:
+        stages.append(replace(search.holds.without_distortion(("k1",)), priors=priors))
+    found: list[tuple[float, Cell]] = []
+    for candidate in candidates[:_SHORT_LIST]:
+        cell, cost = candidate.cell, np.inf
+        for holds in stages:
+            result = _short(search, holds, cell)
+            if result is None:
+                break
+            cell, cost = result
+        if np.isfinite(cost) and not any(abs(cost - c) < _SAME_COST * c for c, _ in found):
+            found.append((cost, cell))
+    return [cell for _, cell in sorted(found, key=lambda pair: pair[0])]
+
+
+def _short(search: Search, holds: Holds, cell: Cell) -> tuple[Cell, float] | None:
+    """One short refinement on the spots that are possible at its start."""
+    try:
+        problem = make_graph(search.observations, search.batch, holds, cell, search.loss)
+        good = ~np.isnan(problem.residuals(problem.start)[:, 0])
+        if good.mean() < _MIN_POSSIBLE:
+            return None
+        if not good.all():
+            problem = replace(problem, batch=search.batch.weighted(good))
+        problem = problem.rescaled(_STAGE_SIGMA_PX / _typical_sigma(search))
+        solution = solve(problem, _SHORT_ITERATIONS, find_scale=False)
+    except DataError:
+        raise
+    except LasercalError:
+        return None
+    return solution.cell, solution.total_cost / float(good.mean())
+
+
+def _typical_sigma(search: Search) -> float:
+    """Typical a-priori pixel sigma of the batch."""
+    return float(1.0 / np.median(search.batch.whitening[:, 2]))
+
+
+def _stage_priors(search: Search) -> dict[str, tuple[float, float]]:
+    """Weak priors of the staged start (method 6.2): principal point, skew, aspect."""
+    observations = search.observations
+    several = len(observations.cameras) > 1
+    priors: dict[str, tuple[float, float]] = {}
+    for c, name in enumerate(observations.cameras):
+        width, height = observations.image_size[name]
+        spread = 0.12 * float(np.hypot(width, height))
+        terms = {
+            "u0": (width / 2, spread), "v0": (height / 2, spread),
+            "skew": (0.0, 0.02), "aspect": (1.0, 0.05),
+        }  # fmt: skip
+        for term, prior in terms.items():
+            tangent = "fu" if term == "aspect" else term
+            if search.holds.held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(tangent)]:
+                continue
+            if term == "aspect" and name in search.holds.aspect:
+                continue
+            row = "alpha_c" if term == "skew" else term
+            priors[(f"{name}." if several else "") + row] = prior
+    return priors
+
+
+def _same_cost(a: Solution, b: Solution) -> bool:
+    return abs(a.cost - b.cost) <= _SAME_COST * max(a.cost, b.cost) + 1e-12
+
+
+def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
+    """Restarts with k2 moved and k1 lowered to compensate (method 6.2, remedy 4)."""
+    found: list[Solution] = []
+    for c, name in enumerate(search.observations.cameras):
+        column = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("k2")
+        if search.holds.held[column]:
+            continue
+        camera = best.cell.cameras[name]
+        r2 = _squared_radii(best.problem, c, camera)
+        r95 = float(np.quantile(r2, 0.95))
+        sigma = _quick_sigma(best, column)
+        for step in _RESTART_STEPS:
+            change = step / r95**2
+            if abs(change) > _RESTART_SIGMAS * sigma:
+                continue
+            k1 = camera.intrinsics.k1 - change * float(np.mean(r2**3) / np.mean(r2**2))
+            moved = replace(camera.intrinsics, k1=k1, k2=camera.intrinsics.k2 + change)
+            cameras = dict(best.cell.cameras)
+            cameras[name] = Camera(moved, camera.T_base_camera, camera.image_size)
+            solution = search.solve_from(Cell(cameras, best.cell.lasers, best.cell.planes))
+            if solution is not None:
+                found.append(solution)
+    return found
+
+
+def _quick_sigma(solution: Solution, column: int) -> float:
+    """Marginal sigma of one tangent coordinate; infinite where it is undetermined."""
+    problem = solution.problem
+    R = square_root_information(problem, problem.values(solution.cell))
+    free = free_columns(problem)
+    unit = np.zeros(problem.keys.n)
+    unit[column] = 1.0
+    x, _, rank, _ = np.linalg.lstsq(R[:, free].T @ R[:, free], unit[free], rcond=None)
+    scale = (
+        np.sqrt(solution.cost / max(2 * problem.batch.used.sum() - free.sum(), 1)) / problem.scale
+    )
+    return float(scale * np.sqrt(x @ unit[free])) if rank == free.sum() else float("inf")
+
+
+def _squared_radii(problem: CellGraph, camera_index: int, camera: Camera) -> np.ndarray:
+    i: Intrinsics = camera.intrinsics
+    uv = problem.spot_pixels(camera_index)
+    return np.asarray(((uv - [i.u0, i.v0]) / [i.fu, i.fv]) ** 2).sum(axis=1)
+
+
+def _fewer_distortion_terms(
+    search: Search, best: Solution, cells: Sequence[Cell]
+) -> list[Solution]:
+    """Where the full distortion gives no plausible answer: k1 only, then none, and say so."""
+    for keep in (("k1",), ()):
+        fewer = search.holds.without_distortion(keep)
+        if np.array_equal(fewer.held, search.holds.held):
+            continue
+        zeros = {t: 0.0 for t in DISTORTION_NAMES if t not in keep}
+        fewer = replace(
+            fewer,
+            known={camera: zeros | values for camera, values in fewer.known.items()},
+            priors={k: v for k, v in fewer.priors.items() if k.rpartition(".")[2] not in zeros},
+            words=(
+                *fewer.words,
+                f"{', '.join(zeros)} held at zero: fitted freely, {best.troubles[0]}",
+            ),
+        )
+        found = [s for s in (search.solve_from(c, fewer) for c in cells) if s and s.plausible]
+        if found:
+            return found
+    return []

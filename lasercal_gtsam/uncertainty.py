@@ -1,0 +1,110 @@
+"""Sigmas: joint covariance from the marginals, a-posteriori scale, Table 2's own parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from lasercal_gtsam.calibration import Parameter, WeakDirection
+from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import CellGraph
+from lasercal_gtsam.observability import weak_directions
+from lasercal_gtsam.report_map import (
+    BeamChart,
+    row_jacobian,
+    row_names,
+    row_values,
+    tangent_labels,
+)
+from lasercal_gtsam.solve import (
+    Solution,
+    degrees_of_freedom,
+    free_columns,
+    refuse_if_singular,
+    square_root_information,
+)
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Joint covariance of a solution.
+
+    Attributes
+    ----------
+    covariance : (n, n) in tangent coordinates at the solution (`report_map`), SI units; NaN where
+        there are no degrees of freedom to estimate the scale from
+    labels : names of the coordinates
+    sigma0 : a-posteriori scale of the pixel sigmas
+    dof : degrees of freedom behind ``sigma0``
+    weak : directions which the data hardly determine
+    """
+
+    covariance: Array
+    labels: tuple[str, ...]
+    sigma0: float
+    dof: float
+    weak: tuple[WeakDirection, ...]
+
+
+def estimate_uncertainty(solution: Solution) -> Uncertainty:
+    """Covariance at a solution, scaled by the residuals (method 5: ``s0^2 = SSE / dof``).
+
+    Held coordinates have zero rows; tied focal lengths move together.
+
+    Raises
+    ------
+    DegenerateError
+        The information is singular; the message names the undetermined directions.
+    """
+    problem = solution.problem.anchored(solution.cell)
+    values = problem.values()
+    labels = tangent_labels(solution.cell)
+    free = free_columns(problem)
+    R = square_root_information(problem, values)
+    refuse_if_singular(problem, values)
+    marginals = gtsam.Marginals(problem.graph, values)
+    joint = marginals.jointMarginalCovariance(list(problem.keys.keys)).fullMatrix()
+    dof = degrees_of_freedom(problem, values)
+    sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
+    unit = sigma0 / problem.scale
+    E = _expansion(problem, free)
+    covariance = unit**2 * (E @ joint[np.ix_(free, free)] @ E.T)
+    strength = np.where(np.isfinite(unit) & (unit > 0), unit, 1.0)
+    weak = weak_directions(R / max(float(strength), 1e-6), labels, free)
+    return Uncertainty(covariance, labels, sigma0, dof, weak)
+
+
+def table_parameters(
+    cell: Cell, initial: Cell, uncertainty: Uncertainty, problem: CellGraph
+) -> tuple[Parameter, ...]:
+    """Rows of the paper's Table 2 with sigmas by exact change of variables."""
+    charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
+    anchored = problem.anchored(cell)
+    frames = dict(zip(cell.lasers, anchored.keys.frames, strict=True))
+    F = row_jacobian(cell, charts, frames)
+    variances = np.einsum("ij,jk,ik->i", F, uncertainty.covariance, F, optimize=True)
+    sigmas = np.sqrt(np.maximum(variances, 0.0))
+    rows = zip(
+        row_names(cell, charts), row_values(initial, charts), row_values(cell, charts), sigmas,
+        strict=True,
+    )  # fmt: skip
+    return tuple(
+        Parameter(name, float(before), float(after), float(sigma), unit)
+        for (name, unit), before, after, sigma in rows
+    )
+
+
+def _expansion(problem: CellGraph, free: Array) -> Array:
+    """(n, n_free): free coordinates of the graph to tangent coordinates of the report."""
+    n = problem.keys.n
+    E = np.eye(n)
+    for c, aspect in enumerate(problem.keys.aspects):
+        if aspect is not None:
+            first = problem.keys.columns[2 * c + 1].start
+            E[first, first + 1] = aspect
+    for columns in problem.keys.columns[len(problem.keys.columns) - len(problem.keys.planes) :]:
+        E[columns.stop - 1] *= -1.0  # GTSAM's plane offset is minus our distance
+    return E[:, free]
