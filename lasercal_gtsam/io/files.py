@@ -1,0 +1,127 @@
+"""Reading and writing whole files: clear errors, and nothing half written."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from lasercal_gtsam.errors import DataError
+
+_NEW_FILE_MODE = 0o666
+
+
+def read_text(path: str | Path) -> str:
+    """Text of a UTF-8 file; a byte-order mark at its start is dropped.
+
+    Raises
+    ------
+    DataError
+        The file is missing, is a folder, may not be read or is not UTF-8.
+    """
+    path = Path(path)
+    content = read_bytes(path)
+    if content.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise DataError(f"{path}: the text is in UTF-16; save it as UTF-8")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise DataError(
+            f"{path}:{line}: byte {content[error.start]:#04x} is not UTF-8 text; save the file as "
+            "UTF-8"
+        ) from None
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Content of a file; `DataError` if it is missing, a folder or may not be read."""
+    path = Path(path)
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path}: {_reason(error)}") from None
+
+
+def sha256_of(path: str | Path) -> str:
+    """SHA-256 of a file's content, in hexadecimal."""
+    return hashlib.sha256(read_bytes(path)).hexdigest()
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a UTF-8 file atomically: the old one stays until the new one is whole on the disk.
+
+    Raises
+    ------
+    DataError
+        The folder is missing or may not be written to, or the disk is full.
+    """
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file atomically; see `write_text`."""
+    with replacing(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[Path]:
+    """Give a temporary path in the same folder; on leaving without an error it becomes ``path``.
+
+    The temporary file is flushed to the disk before it is renamed, and removed on any error. A
+    link is followed, and the mode of an existing file is kept.
+    """
+    path = Path(path)
+    target = path.resolve()
+    temporary: Path | None = None
+    try:
+        if target.is_dir():
+            raise IsADirectoryError
+        handle, name = tempfile.mkstemp(
+            prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent
+        )
+        os.close(handle)
+        temporary = Path(name)
+        yield temporary
+        temporary.chmod(_mode(target))
+        _flush(temporary)
+        temporary.replace(target)
+        temporary = None
+        _flush(target.parent)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {_reason(error)}") from None
+    finally:
+        if temporary is not None:
+            with suppress(OSError):
+                temporary.unlink()
+
+
+def _mode(target: Path) -> int:
+    if target.exists():
+        return target.stat().st_mode & 0o7777
+    mask = os.umask(0)
+    os.umask(mask)
+    return _NEW_FILE_MODE & ~mask
+
+
+def _flush(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _reason(error: OSError) -> str:
+    if isinstance(error, FileNotFoundError):
+        return "there is no such file or folder"
+    if isinstance(error, IsADirectoryError):
+        return "this is a folder, expected a file"
+    if isinstance(error, NotADirectoryError):
+        return "a part of the path is a file, not a folder"
+    if isinstance(error, PermissionError):
+        return "permission denied"
+    return error.strerror or type(error).__name__
