@@ -451,8 +451,8 @@ def _expose(
     electrons = options.full_well_e * np.maximum(light * scene.gain, 0)
     noise = np.sqrt(electrons + options.read_noise_e**2) * _normal(rng, light.shape)
     level = (electrons + noise) * (options.full_scale / options.full_well_e)
-    dtype = np.uint8 if options.bits == 8 else np.uint16
-    return np.clip(np.rint(level), 0, options.full_scale).astype(dtype)
+    level = np.clip(np.rint(level), 0, options.full_scale)
+    return level.astype(np.uint8) if options.bits == 8 else level.astype(np.uint16)
 
 
 def _normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
