@@ -16,7 +16,7 @@ Arrays of a state (C cameras, L lasers, P planes)
 cam_R (C, 3, 3), cam_t (C, 3): ``T_base_camera``; cam_K (C, 9): ``fu fv skew u0 v0 k1 k2 p1 p2``
 beam_R (L, 3, 3), beam_t (L, 3), beam_l (L, 4): constant frame and ``a, b, x, y``: the beam runs along
 ``beam_R (a, b, 1)`` through ``beam_t + beam_R (x, y, 0)``, in hand coordinates
-plane_n (P, 3), plane_B (P, 3, 2), plane_d (P,): ``n . x = d``; ``B`` = basis of the normal's tangent
+plane_n (P, 3), plane_d (P,): ``n . x = d``
 
 Columns of a spot's row: camera pose 6 (rotation first, camera frame, as `gtsam.Pose3`), intrinsics 9,
 beam 4, plane 3 (normal 2, then the offset **as GTSAM stores it**, ``-d``), and the residual last.
@@ -198,6 +198,30 @@ def _row(uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J):  # type: ignore[no-unt
 
 
 @_jit
+def tangent_basis(n):  # type: ignore[no-untyped-def]
+    """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
+    a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
+    axis = np.zeros(3)
+    if a0 <= a1 and a0 <= a2:
+        axis[0] = 1.0
+    elif a1 <= a0 and a1 <= a2:
+        axis[1] = 1.0
+    else:
+        axis[2] = 1.0
+    B = np.empty((3, 2))
+    e = np.array(
+        [n[1] * axis[2] - n[2] * axis[1], n[2] * axis[0] - n[0] * axis[2],
+         n[0] * axis[1] - n[1] * axis[0]]
+    )  # fmt: skip
+    e /= math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    B[:, 0] = e
+    B[0, 1] = n[1] * e[2] - n[2] * e[1]
+    B[1, 1] = n[2] * e[0] - n[0] * e[2]
+    B[2, 1] = n[0] * e[1] - n[1] * e[0]
+    return B
+
+
+@_jit
 def residuals(uv, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
               plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
     """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
@@ -240,16 +264,17 @@ def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, ca
 
 @_jit
 def rows(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
-         beam_R, beam_t, beam_l, plane_n, plane_B, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
+         beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
     """Whitened Jacobian and residual of every spot, (N, 2, 23); NaN where no spot can be."""
     out = np.empty((len(uv), 2, 23))
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        B = tangent_basis(plane_n[p])
         for k in range(blocks[m, 3], blocks[m, 4]):
             ok = _row(
                 uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
-                plane_n[p], plane_B[p], plane_d[p], cam_R[c], cam_t[c], cam_K[c], out[k],
+                plane_n[p], B, plane_d[p], cam_R[c], cam_t[c], cam_K[c], out[k],
             )  # fmt: skip
             if not ok:
                 out[k] = np.nan
@@ -258,7 +283,7 @@ def rows(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
 
 @_jit
 def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam_R, cam_t, cam_K,
-                beam_R, beam_t, beam_l, plane_n, plane_B, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+                beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
     """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
@@ -270,13 +295,14 @@ def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        B = tangent_basis(plane_n[p])
         local[:] = 0.0
         for k in range(blocks[m, 3], blocks[m, 4]):
             if whitening[k, 2] == 0.0:
                 continue
             ok = _row(
                 uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
-                plane_n[p], plane_B[p], plane_d[p], cam_R[c], cam_t[c], cam_K[c], J,
+                plane_n[p], B, plane_d[p], cam_R[c], cam_t[c], cam_K[c], J,
             )  # fmt: skip
             if not ok:
                 H[0, 0] = np.nan
@@ -340,7 +366,7 @@ def constrain(H, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-
 
 @_jit
 def cholesky(H):  # type: ignore[no-untyped-def]
-    """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1), Fortran order; zero rows for null pivots."""
+    """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1); zero rows for null pivots."""
     size = len(H)
     Rt = np.zeros((size, size))
     for i in range(size):
@@ -356,28 +382,22 @@ def cholesky(H):  # type: ignore[no-untyped-def]
             for k in range(i):
                 v -= Rt[i, k] * Rt[j, k]
             Rt[j, i] = v / root
-    return Rt.T
+    return np.ascontiguousarray(Rt.T)
 
 
 @_jit
-def tangent_basis(n):  # type: ignore[no-untyped-def]
-    """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
-    a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
-    axis = np.zeros(3)
-    if a0 <= a1 and a0 <= a2:
-        axis[0] = 1.0
-    elif a1 <= a0 and a1 <= a2:
-        axis[1] = 1.0
-    else:
-        axis[2] = 1.0
-    B = np.empty((3, 2))
-    e = np.array(
-        [n[1] * axis[2] - n[2] * axis[1], n[2] * axis[0] - n[0] * axis[2],
-         n[0] * axis[1] - n[1] * axis[0]]
+def square_root_information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n,
+                            cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d,
+                            kind, c_loss, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-def]  # fmt: skip
+    """`information`, `constrain` and `cholesky` in one go: ``R`` (n+1, n+1), last column residual.
+
+    [0, 0] is NaN where a spot cannot be.
+    """
+    H = information(
+        uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam_R, cam_t, cam_K,
+        beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss,
     )  # fmt: skip
-    e /= math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    B[:, 0] = e
-    B[0, 1] = n[1] * e[2] - n[2] * e[1]
-    B[1, 1] = n[2] * e[0] - n[0] * e[2]
-    B[2, 1] = n[0] * e[1] - n[1] * e[0]
-    return B
+    if not math.isfinite(H[0, 0]):
+        return H
+    constrain(H, held, tie_from, tie_to, tie_ratio)
+    return cholesky(H)

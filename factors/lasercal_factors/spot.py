@@ -106,21 +106,25 @@ class CellKeys:
 
     def read(self, values: gtsam.Values) -> State:
         """Arrays of the variables in ``values``."""
-        poses = [values.atPose3(x) for x, _ in self.cameras]
-        cam_K = np.array([values.atCal3DS2(k).vector() for _, k in self.cameras])
-        for c, aspect in enumerate(self.aspects):
+        n_cameras, n_planes = len(self.cameras), len(self.planes)
+        cam_R, cam_t = np.empty((n_cameras, 3, 3)), np.empty((n_cameras, 3))
+        cam_K = np.empty((n_cameras, 9))
+        for c, (x, k) in enumerate(self.cameras):
+            pose = values.atPose3(x)
+            cam_R[c] = pose.rotation().matrix()
+            cam_t[c] = pose.translation()
+            cam_K[c] = values.atCal3DS2(k).vector()
+            aspect = self.aspects[c]
             if aspect is not None:
                 cam_K[c, 0] = aspect * cam_K[c, 1]
-        planes = np.array([values.atOrientedPlane3(p).planeCoefficients() for p in self.planes])
-        return State(
-            np.array([p.rotation().matrix() for p in poses]),
-            np.array([p.translation() for p in poses]),
-            cam_K,
-            *self._frame_arrays,
-            np.array([values.atVector(x) for x in self.lasers]),
-            np.ascontiguousarray(planes[:, :3]),
-            -planes[:, 3],
-        )
+        beam_l = np.empty((len(self.lasers), 4))
+        for i, key in enumerate(self.lasers):
+            beam_l[i] = values.atVector(key)
+        planes = np.empty((n_planes, 4))
+        for i, key in enumerate(self.planes):
+            planes[i] = values.atOrientedPlane3(key).planeCoefficients()
+        plane_n = planes[:, :3].copy()
+        return State(cam_R, cam_t, cam_K, *self._frame_arrays, beam_l, plane_n, -planes[:, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,45 +222,16 @@ class SpotBatch:
     def rows(self, state: State) -> Array:
         """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
         out = np.empty((len(self), 2, kernels.COLUMNS))
-        out[self.order] = kernels.rows(
-            self.uv, self.whitening, self.R_base_hand, self.t_base_hand, self.blocks,
-            *state[:7], tangent_bases(state.plane_n), state.plane_d,
-        )  # fmt: skip
+        out[self.order] = kernels.rows(*self._arrays, *state)
         return out
 
     def total_loss(self, state: State, loss: Loss) -> float:
         """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
-        return float(
-            kernels.total_loss(
-                self.uv,
-                self.whitening,
-                self.R_base_hand,
-                self.t_base_hand,
-                self.blocks,
-                *state,
-                LOSSES[loss.name],
-                loss.threshold,
-            )  # fmt: skip
-        )
+        return float(kernels.total_loss(*self._arrays, *state, LOSSES[loss.name], loss.threshold))
 
-    def information(self, state: State, offsets: Index, n: int, loss: Loss) -> Array:
-        """Augmented information (n+1, n+1), upper triangle."""
-        return np.asarray(
-            kernels.information(
-                self.uv,
-                self.whitening,
-                self.R_base_hand,
-                self.t_base_hand,
-                self.blocks,
-                offsets,
-                n,
-                *state[:7],
-                tangent_bases(state.plane_n),
-                state.plane_d,
-                LOSSES[loss.name],
-                loss.threshold,
-            )  # fmt: skip
-        )
+    @property
+    def _arrays(self) -> tuple[Array, Array, Array, Array, Index]:
+        return self.uv, self.whitening, self.R_base_hand, self.t_base_hand, self.blocks
 
 
 def LaserSpotFactor(
@@ -339,7 +314,7 @@ def LaserSpotBatchFactor(
     if np.any(batch.blocks[:, :3].max(axis=0) >= limits):
         raise FactorError(f"batch: indices up to {batch.blocks[:, :3].max(axis=0)}, keys {limits}")
     n = keys.n
-    compress = Compressor(keys, held)
+    compress = Compressor(keys, batch, loss, held)
     noise = gtsam.noiseModel.Unit.Create(n + 1)
     columns = keys.columns
 
@@ -349,55 +324,51 @@ def LaserSpotBatchFactor(
         return e
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
-        R = compress(batch, keys.read(values), loss)
+        R = compress(keys.read(values))
         return R[:, n], [R[:, c] for c in columns]
 
     return custom_factor("LaserSpotBatchFactor", noise, keys.keys, keys.dims, error, linearize)
 
 
 class Compressor:
-    """Square-root information of a batch at a state, with held coordinates and tied focal lengths."""
+    """Square-root information of a batch at any state, with held coordinates and ties."""
 
-    def __init__(self, keys: CellKeys, held: npt.ArrayLike | None = None) -> None:
+    def __init__(
+        self, keys: CellKeys, batch: SpotBatch, loss: Loss, held: npt.ArrayLike | None = None
+    ) -> None:
         first = {key: c.start for key, c in zip(keys.keys, keys.columns, strict=True)}
-        self._camera = np.array([[first[x], first[k]] for x, k in keys.cameras], dtype=np.int64)
-        self._laser = np.array([first[x] for x in keys.lasers], dtype=np.int64)
-        self._plane = np.array([first[x] for x in keys.planes], dtype=np.int64)
-        self._n = keys.n
-        tied = [(c, a) for c, a in enumerate(keys.aspects) if a is not None]
-        self._ties = (
-            np.array([self._camera[c, 1] for c, _ in tied], dtype=np.int64),
-            np.array([self._camera[c, 1] + 1 for c, _ in tied], dtype=np.int64),
-            np.array([a for _, a in tied], dtype=np.float64),
-        )
-        self._held = np.zeros(keys.n, np.bool_) if held is None else np.array(held, np.bool_)
-        if self._held.shape != (keys.n,):
-            raise FactorError(f"held: expected ({keys.n},) booleans, got {self._held.shape}")
-        self._held[self._ties[0]] = True
+        camera = np.array([[first[x], first[k]] for x, k in keys.cameras], dtype=np.int64)
+        laser = np.array([first[x] for x in keys.lasers], dtype=np.int64)
+        plane = np.array([first[x] for x in keys.planes], dtype=np.int64)
+        c, l, p = batch.blocks[:, :3].T  # noqa: E741
+        offsets = np.column_stack([camera[c], laser[l], plane[p]])
+        mask = np.zeros(keys.n, np.bool_) if held is None else np.array(held, np.bool_)
+        if mask.shape != (keys.n,):
+            raise FactorError(f"held: expected ({keys.n},) booleans, got {mask.shape}")
+        tied = [(i, a) for i, a in enumerate(keys.aspects) if a is not None]
+        tie_from = np.array([camera[i, 1] for i, _ in tied], dtype=np.int64)
+        mask[tie_from] = True
+        ratio = np.array([a for _, a in tied], dtype=np.float64)
+        self._data = (*batch._arrays, offsets, keys.n)
+        self._tail = (
+            LOSSES[loss.name], loss.threshold, mask, tie_from, tie_from + 1, ratio,
+        )  # fmt: skip
 
-    def __call__(self, batch: SpotBatch, state: State, loss: Loss) -> Array:
-        """Upper triangular ``R`` (n+1, n+1) with ``R.T R = [J r]^T [J r]``; last column: residual.
+    def __call__(self, state: State) -> Array:
+        """Upper triangular ``R`` (n+1, n+1), ``R.T R = [J r]^T [J r]``; last column the residual.
 
         Raises
         ------
         FactorError
             A spot cannot be at this state (beam away from the plane, or behind the camera).
         """
-        c, l, p = batch.blocks[:, :3].T  # noqa: E741
-        offsets = np.column_stack([self._camera[c], self._laser[l], self._plane[p]])
-        H = batch.information(state, offsets, self._n, loss)
-        if not math.isfinite(H[0, 0]):
+        R = kernels.square_root_information(*self._data, *state, *self._tail)
+        if not math.isfinite(R[0, 0]):
             raise FactorError(
                 "linearised where a beam misses its plane, a spot lies behind its camera, or the "
                 "distortion folds; check the start value"
             )
-        kernels.constrain(H, self._held, *self._ties)
-        return np.asarray(kernels.cholesky(H))
-
-
-def tangent_bases(normals: Array) -> Array:
-    """(P, 3, 2) bases of the normals' tangent spaces, those of `gtsam.Unit3`."""
-    return np.array([kernels.tangent_basis(n) for n in normals])
+        return np.asarray(R)
 
 
 def whitening_from_covariance(cov: Array) -> Array:
