@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.projection import project
 from lasercal_gtsam.simulate.render import (
     Picture,
     RenderOptions,
@@ -55,18 +54,6 @@ class Shot(NamedTuple):
     off: Picture
 
 
-def true_spots(simulation: Simulation) -> Array:
-    """Pixels (N, 2) where the beam's axis shows: the real hand, without pixel noise."""
-    seen = simulation.observations
-    return project(
-        simulation.truth,
-        simulation.T_base_hand_actual,
-        plane=seen.plane.tolist(),
-        camera=seen.camera.tolist(),
-        laser=seen.laser.tolist(),
-    )
-
-
 def render_pictures(
     simulation: Simulation, options: PictureOptions | None = None
 ) -> Iterator[Shot]:
@@ -91,7 +78,7 @@ def render_pictures(
         options.beam_radius_m,
     )
     scenes: dict[tuple[int, int], Scene] = {}
-    for k, (uv, shape) in enumerate(zip(true_spots(simulation), shapes, strict=True)):
+    for k, (uv, shape) in enumerate(zip(simulation.uv_true, shapes, strict=True)):
         where = int(seen.camera_index[k]), int(seen.plane_index[k])
         if where not in scenes:
             size = seen.image_size[str(seen.camera[k])]

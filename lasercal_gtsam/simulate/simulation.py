@@ -62,6 +62,18 @@ class Simulation(FrozenData):
         object.__setattr__(self, "group", group)
         object.__setattr__(self, "known", dict(self.known))
 
+    @property
+    def uv_true(self) -> Array:
+        """(N, 2) pixels where the beam's axis shows: the real hand, without pixel noise."""
+        seen = self.observations
+        return project(
+            self.truth,
+            self.T_base_hand_actual,
+            plane=seen.plane.tolist(),
+            camera=seen.camera.tolist(),
+            laser=seen.laser.tolist(),
+        )
+
 
 def simulate(
     preset: str = "paper",
