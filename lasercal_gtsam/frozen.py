@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,10 +30,23 @@ class FrozenData:
 
 
 def _equal(a: Any, b: Any) -> bool:
+    """Equality by value through containers; NaN, which stands for "not known", equals NaN."""
     if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
         a, b = np.asarray(a), np.asarray(b)
         numeric = a.dtype.kind == "f" and b.dtype.kind == "f"
         return bool(np.array_equal(a, b, equal_nan=numeric))
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b or (a != a and b != b)
+    if isinstance(a, tuple | list) and isinstance(b, tuple | list):
+        return len(a) == len(b) and all(map(_equal, a, b))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_equal(a[key], b[key]) for key in a)
+    if dataclasses.is_dataclass(a) and type(a) is type(b):
+        return all(
+            _equal(getattr(a, f.name), getattr(b, f.name))
+            for f in dataclasses.fields(a)
+            if f.compare
+        )
     return bool(a == b)
 
 

@@ -176,7 +176,8 @@ class Capture(FrozenData):
         return CalibrationOptions(**{**stated, **overrides, "known": known})
 
     def _default_detector(self) -> Detector:
-        from lasercal_gtsam.detect import DetectionOptions, detect_spot
+        from lasercal_gtsam.detect.options import DetectionOptions
+        from lasercal_gtsam.detect.pipeline import detect_spot
 
         options = DetectionOptions(saturation_level=self.saturation)
         return lambda on, off: detect_spot(on, off, options)

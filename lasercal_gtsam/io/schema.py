@@ -39,44 +39,36 @@ def _sentence(item: Any, model: type[BaseModel]) -> str:
     location: Location = item["loc"]
     kind: str = item["type"]
     if kind == "extra_forbidden":
-        owner = _owner(model, location)
-        allowed = [*owner.model_fields] if owner else []
+        _, owner = _look_up(model, location[:-1])
+        allowed = list(owner.model_fields) if owner else []
         name = str(location[-1])
         return f"unknown key{did_you_mean(name, allowed)}; allowed are {', '.join(allowed)}"
-    field = _field(model, location)
+    field, _ = _look_up(model, location)
     expected = field.description if field and field.description else None
     if kind == "missing":
-        return f"left out; expected {expected or 'a value'}"
+        return f"left out; expected {expected}" if expected else "left out"
     if kind == "value_error":
         return str(item["ctx"]["error"])
-    return f"expected {expected or _lower_first(item['msg'])}, got {_shown(item['input'])}"
+    return f"expected {expected or _what(item['msg'])}, got {_shown(item['input'])}"
 
 
-def _field(model: type[BaseModel], location: Location) -> FieldInfo | None:
-    """The field at a location, or the nearest one around it."""
-    found: FieldInfo | None = None
+def _look_up(
+    model: type[BaseModel], location: Location
+) -> tuple[FieldInfo | None, type[BaseModel] | None]:
+    """The innermost field on the way to a location, and the model that holds what is in it."""
+    field: FieldInfo | None = None
+    owner: type[BaseModel] | None = model
+    is_name = False
     for part in location:
-        if isinstance(part, int):
+        if isinstance(part, int) or is_name:
+            is_name = False
             continue
-        if model is None or part not in model.model_fields:
+        if owner is None or part not in owner.model_fields:
             break
-        found = model.model_fields[part]
-        inner = _model_in(found.annotation)
-        if inner is None:
-            break
-        model = inner
-    return found
-
-
-def _owner(model: type[BaseModel], location: Location) -> type[BaseModel] | None:
-    """The model that the last key of a location belongs to."""
-    for part in location[:-1]:
-        if isinstance(part, str):
-            inner = _model_in(model.model_fields[part].annotation)
-            if inner is None:
-                return None
-            model = inner
-    return model
+        field = owner.model_fields[part]
+        owner = _model_in(field.annotation)
+        is_name = get_origin(field.annotation) is dict
+    return field, owner
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
@@ -102,5 +94,6 @@ def _shown(value: Any) -> str:
     return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 3] + "..."
 
 
-def _lower_first(text: str) -> str:
-    return text[:1].lower() + text[1:]
+def _what(message: str) -> str:
+    """``a valid number`` out of "Input should be a valid number"."""
+    return message.removeprefix("Input should be ")

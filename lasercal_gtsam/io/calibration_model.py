@@ -1,0 +1,364 @@
+"""``calibration.json`` as checked data: its keys and shapes, and the objects built from them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
+
+from lasercal_gtsam.calibration import (
+    Calibration,
+    Fit,
+    Inputs,
+    Observability,
+    Parameter,
+    SpotResults,
+    WeakDirection,
+)
+from lasercal_gtsam.cell import ROTATION_TOLERANCE, Beam, Camera, Cell, Intrinsics, Plane
+from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.io.conventions import rotations_from_columns
+from lasercal_gtsam.io.wording import did_you_mean
+from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.rotations import make_pose
+
+# Matrix and quaternion of one pose are the same rotation written twice; the matrix need not be
+# orthonormal to the last digit, the quaternion's always is.
+POSE_AGREEMENT = 10 * ROTATION_TOLERANCE
+
+_INFINITIES = {"inf": math.inf, "-inf": -math.inf}
+
+T = TypeVar("T")
+
+
+def _number(value: Any) -> Any:
+    """JSON has no NaN and no infinity: null and two words stand for them."""
+    if value is None:
+        return math.nan
+    return _INFINITIES.get(value, value) if isinstance(value, str) else value
+
+
+def _array(*shape: int | None) -> Callable[[Any], Array]:
+    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
+
+    def convert(value: Any) -> Array:
+        if not isinstance(value, list):
+            raise ValueError(f"expected a list of numbers of shape {wanted}, got {value!r:.60}")
+        try:
+            array = np.array(value, dtype=np.float64)
+        except (TypeError, ValueError):
+            raise ValueError(f"expected numbers of shape {wanted}, got {value!r:.60}") from None
+        if not array.size:
+            array = array.reshape([0 if n is None else n for n in shape] if None in shape else -1)
+        if array.ndim != len(shape) or any(
+            n not in (None, m) for n, m in zip(shape, array.shape, strict=True)
+        ):
+            raise ValueError(f"expected numbers of shape {wanted}, got shape {array.shape}")
+        return array
+
+    return convert
+
+
+Number = Annotated[float, BeforeValidator(_number)]
+Vector2 = Annotated[Array, PlainValidator(_array(2))]
+Vector3 = Annotated[Array, PlainValidator(_array(3))]
+Vector4 = Annotated[Array, PlainValidator(_array(4))]
+Matrix44 = Annotated[Array, PlainValidator(_array(4, 4))]
+Matrix = Annotated[Array, PlainValidator(_array(None, None))]
+Rows2 = Annotated[Array, PlainValidator(_array(None, 2))]
+Rows4 = Annotated[Array, PlainValidator(_array(None, 4))]
+Rows16 = Annotated[Array, PlainValidator(_array(None, 16))]
+Size = Annotated[list[int], Field(min_length=2, max_length=2)]
+
+
+class _Part(BaseModel):
+    """Keys that a later version adds are ignored; missing and wrong ones are errors."""
+
+    model_config = ConfigDict(extra="ignore", strict=True, arbitrary_types_allowed=True)
+
+
+class PoseModel(_Part):
+    """A transform; the matrix is exact, the other two are for readers."""
+
+    translation_m: Vector3
+    quat_wxyz: Vector4
+    matrix: Matrix44 | None = None
+
+    @model_validator(mode="after")
+    def _agree(self) -> PoseModel:
+        if self.matrix is not None:
+            difference = float(np.abs(self.matrix - self._from_quaternion()).max())
+            if not difference <= POSE_AGREEMENT:
+                raise ValueError(
+                    "translation_m and quat_wxyz are another pose than matrix (elements differ by "
+                    f"{difference:.2g}); after editing by hand remove matrix"
+                )
+        return self
+
+    def _from_quaternion(self) -> Array:
+        try:
+            R = rotations_from_columns("quat_wxyz", self.quat_wxyz[None])[0]
+        except DataError as error:
+            raise ValueError(f"quat_wxyz: {error}") from None
+        return make_pose(R, self.translation_m)
+
+    def build(self) -> Array:
+        """The 4x4 matrix."""
+        return self._from_quaternion() if self.matrix is None else self.matrix
+
+
+class IntrinsicsModel(_Part):
+    """Intrinsics, all nine named."""
+
+    fu: Number
+    fv: Number
+    skew: Number
+    u0: Number
+    v0: Number
+    k1: Number
+    k2: Number
+    p1: Number
+    p2: Number
+
+
+class CameraModel(_Part):
+    """One camera."""
+
+    image_size: Size
+    intrinsics: IntrinsicsModel
+    T_base_camera: PoseModel
+
+    def build(self) -> Camera:
+        """The camera."""
+        intrinsics = Intrinsics(**self.intrinsics.model_dump())
+        width, height = self.image_size
+        return Camera(intrinsics, self.T_base_camera.build(), (width, height))
+
+
+class LaserModel(_Part):
+    """One beam."""
+
+    direction_hand: Vector3
+    point_hand_m: Vector3
+
+    def build(self) -> Beam:
+        """The beam."""
+        return Beam(self.direction_hand, self.point_hand_m)
+
+
+class PlaneModel(_Part):
+    """One plane."""
+
+    normal_base: Vector3
+    distance_m: Number
+
+    def build(self) -> Plane:
+        """The plane."""
+        return Plane(self.normal_base, self.distance_m)
+
+
+class CellModel(_Part):
+    """A cell by names."""
+
+    cameras: dict[str, CameraModel]
+    lasers: dict[str, LaserModel]
+    planes: dict[str, PlaneModel]
+
+    def build_cell(self, where: str, problems: list[str]) -> Cell | None:
+        """The cell, or None and what is wrong with its parts (named after ``where``)."""
+        cameras = {
+            name: _built(f"{where}cameras.{name}", m.build, problems)
+            for name, m in self.cameras.items()
+        }
+        lasers = {
+            name: _built(f"{where}lasers.{name}", m.build, problems)
+            for name, m in self.lasers.items()
+        }
+        planes = {
+            name: _built(f"{where}planes.{name}", m.build, problems)
+            for name, m in self.planes.items()
+        }
+        if problems:
+            return None
+        return Cell(
+            {name: part for name, part in cameras.items() if part is not None},
+            {name: part for name, part in lasers.items() if part is not None},
+            {name: part for name, part in planes.items() if part is not None},
+        )
+
+
+class ParameterModel(_Part):
+    """One row of the table."""
+
+    name: str
+    initial: Number
+    refined: Number
+    sigma: Number
+    unit: str
+
+
+class CovarianceModel(_Part):
+    """The joint covariance."""
+
+    labels: list[str]
+    matrix: Matrix
+
+
+class FitModel(_Part):
+    """How the fit went."""
+
+    rms_px: Number
+    sigma0: Number
+    dof: Number
+    iterations: int
+    converged: bool
+    status: str
+    n_spots: int
+    n_rejected: int
+
+
+class SpotModel(_Part):
+    """The account of one spot."""
+
+    id: str
+    plane: str
+    camera: str
+    laser: str
+    residual_px: Vector2
+    weight: Number
+    rejected: str | None
+
+
+class WeakModel(_Part):
+    """One weak direction."""
+
+    strength: Number
+    words: str
+
+
+class ObservabilityModel(_Part):
+    """What the data hardly determine."""
+
+    weak: list[WeakModel]
+    held: list[str]
+    notes: list[str]
+
+
+class ObservationsModel(_Part):
+    """Observations as columns."""
+
+    id: list[str]
+    plane: list[str]
+    camera: list[str]
+    laser: list[str]
+    image_size: dict[str, Size]
+    uv: Rows2
+    cov_uv: Rows4 | None
+    T_base_hand: Rows16
+
+    def build(self) -> Observations:
+        """The observations."""
+        count = len(self.uv)
+        if len(self.T_base_hand) != count:
+            raise DataError(f"{count} pixels uv but {len(self.T_base_hand)} poses T_base_hand")
+        cov = np.full((count, 4), np.nan) if self.cov_uv is None else self.cov_uv
+        if len(cov) != count:
+            raise DataError(f"{count} pixels uv but {len(cov)} covariances cov_uv")
+        return Observations(
+            uv=self.uv,
+            cov_uv=cov.reshape(-1, 2, 2),
+            T_base_hand=self.T_base_hand.reshape(-1, 4, 4),
+            camera=np.array(self.camera, dtype=np.str_),
+            laser=np.array(self.laser, dtype=np.str_),
+            plane=np.array(self.plane, dtype=np.str_),
+            id=np.array(self.id, dtype=np.str_),
+            image_size={name: (size[0], size[1]) for name, size in self.image_size.items()},
+        )
+
+
+class InputsModel(_Part):
+    """What went in."""
+
+    observations: ObservationsModel
+    options: dict[str, Any]
+
+    def build_options(self) -> CalibrationOptions:
+        """The options; later versions may have more of them, which this one cannot obey."""
+        allowed = [f.name for f in fields(CalibrationOptions)]
+        unknown = [name for name in self.options if name not in allowed]
+        if unknown:
+            raise DataError(
+                *(f"unknown option {name!r}{did_you_mean(name, allowed)}" for name in unknown)
+            )
+        return CalibrationOptions(**{name: _tuples(v) for name, v in self.options.items()})
+
+
+class CalibrationModel(CellModel):
+    """The whole file."""
+
+    initial: CellModel
+    parameters: list[ParameterModel]
+    covariance: CovarianceModel
+    fit: FitModel
+    spots: list[SpotModel]
+    observability: ObservabilityModel
+    inputs: InputsModel
+
+    def build(self) -> Calibration:
+        """The calibration; `DataError` names all parts that are wrong."""
+        problems: list[str] = []
+        cell = self.build_cell("", problems)
+        initial = self.initial.build_cell("initial.", problems)
+        observations = _built("inputs.observations", self.inputs.observations.build, problems)
+        options = _built("inputs.options", self.inputs.build_options, problems)
+        if cell is None or initial is None or observations is None or options is None:
+            raise DataError(*problems)
+        return Calibration(
+            cell=cell,
+            initial=initial,
+            parameters=tuple(Parameter(**row.model_dump()) for row in self.parameters),
+            covariance=self.covariance.matrix,
+            labels=tuple(self.covariance.labels),
+            fit=Fit(**self.fit.model_dump()),
+            spots=self._spots(),
+            observability=Observability(
+                tuple(WeakDirection(w.strength, w.words) for w in self.observability.weak),
+                tuple(self.observability.held),
+                tuple(self.observability.notes),
+            ),
+            inputs=Inputs(observations, options),
+        )
+
+    def _spots(self) -> SpotResults:
+        return SpotResults(
+            id=np.array([s.id for s in self.spots], dtype=np.str_),
+            plane=np.array([s.plane for s in self.spots], dtype=np.str_),
+            camera=np.array([s.camera for s in self.spots], dtype=np.str_),
+            laser=np.array([s.laser for s in self.spots], dtype=np.str_),
+            residual_px=np.array([s.residual_px for s in self.spots]).reshape(-1, 2),
+            weight=np.array([s.weight for s in self.spots]),
+            rejected=tuple(s.rejected for s in self.spots),
+        )
+
+
+def _built(where: str, build: Callable[[], T], problems: list[str]) -> T | None:
+    try:
+        return build()
+    except DataError as error:
+        problems += [f"{where}: {text}" for text in error.problems]
+        return None
+
+
+def _tuples(value: Any) -> Any:
+    """Lists as the tuples they were before JSON, infinities as numbers."""
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    return _INFINITIES.get(value, value) if isinstance(value, str) else value
