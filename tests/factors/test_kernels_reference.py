@@ -94,7 +94,6 @@ def test_kernel_rows_are_the_reference_derivative(beam: str, normal: str) -> Non
         spots.t_base_hand,
         np.array([[0, 0, 0, 0, count]]),
         *(np.ascontiguousarray(x)[None] for x in state[:7]),
-        np.ascontiguousarray(basis)[None],
         np.atleast_1d(state.distance),
     )
     expected = W @ reference.jacobian_complex_step(spots, state, basis)
