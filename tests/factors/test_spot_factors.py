@@ -58,7 +58,9 @@ class Scene:
         names = [list(planes)[i] for i in self.plane]
         self.uv = project(self.cell, self.T, plane=names) + rng.standard_normal((count, 2))
         assert np.isfinite(self.uv).all()
-        self.frame = BeamFrame.from_line(direction + np.array([0.02, -0.01, 0.015]), [0.0, 0.0, 0.02])
+        self.frame = BeamFrame.from_line(
+            direction + np.array([0.02, -0.01, 0.015]), [0.0, 0.0, 0.02]
+        )
         self.keys = keys_for(1, 1, 2, [self.frame])
         self.batch = SpotBatch.from_arrays(
             self.uv, np.broadcast_to(COVARIANCE, (count, 2, 2)), self.T,
