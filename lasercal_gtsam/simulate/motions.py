@@ -64,7 +64,10 @@ class MotionDesign:
             if not 0 < low <= high:
                 problems.append(f"{name}: expected 0 < low <= high (metres), got {(low, high)}")
         if not 0 < self.shortest <= self.longest:
-            problems.append(f"shortest, longest: got {self.shortest}, {self.longest} (metres)")
+            problems.append(
+                f"shortest, longest: expected 0 < shortest <= longest (metres), got "
+                f"{self.shortest}, {self.longest}"
+            )
         if not 0 <= self.cone < np.pi / 2 or not 0 <= self.roll <= np.pi:
             problems.append(
                 f"cone, roll: expected radians below pi/2 and pi, got {self.cone}, {self.roll}"

@@ -151,12 +151,11 @@ def simulate_cell(
     camera = _only(cell.cameras, camera, "camera")
     laser = _only(cell.lasers, laser, "laser")
     names = sorted(cell.planes, key=natural_key) if planes is None else list(planes)
-    _check_request(cell, names, groups, shots)
+    counts = _checked_counts(cell, names, groups, shots)
     if isinstance(design, str):
         design = design_named(design)
     rng = stream(seed, MOTIONS)
     view = cell.cameras[camera], cell.lasers[laser]
-    counts = [groups if isinstance(groups, int) else groups[name] for name in names]
     planned = [
         plan_motions(*view, cell.planes[name], count, shots, design, rng)
         for name, count in zip(names, counts, strict=True)
@@ -248,9 +247,10 @@ def _only(parts: Mapping[str, Any], name: str | None, kind: str) -> str:
     return str(name)
 
 
-def _check_request(
+def _checked_counts(
     cell: Cell, planes: Sequence[str], groups: int | Mapping[str, int], shots: int
-) -> None:
+) -> list[int]:
+    """Number of groups for each of the planes, or a `DataError` with all that is wrong."""
     problems = []
     unknown = [name for name in planes if name not in cell.planes]
     if unknown:
@@ -259,14 +259,20 @@ def _check_request(
         problems.append("no plane to put spots on")
     if len(set(planes)) != len(planes):
         problems.append(f"a plane is named twice: {list(planes)}")
-    counts = dict.fromkeys(planes, groups) if isinstance(groups, int) else dict(groups)
-    problems += [f"no number of groups for plane {name!r}" for name in planes if name not in counts]
-    problems += [
-        f"groups on plane {name!r}: expected an integer >= 1, got {counts[name]!r}"
-        for name in planes
-        if name in counts and (not isinstance(counts[name], int) or counts[name] < 1)
-    ]
-    if not isinstance(shots, int) or shots < 1:
+    counts = groups if isinstance(groups, Mapping) else dict.fromkeys(planes, groups)
+    for name in planes:
+        if name not in counts:
+            problems.append(f"no number of groups for plane {name!r}")
+        elif not _is_count(counts[name]):
+            problems.append(
+                f"groups on plane {name!r}: expected an integer >= 1, got {counts[name]!r}"
+            )
+    if not _is_count(shots):
         problems.append(f"shots: expected an integer >= 1, got {shots!r}")
     if problems:
         raise DataError(*(f"simulate_cell: {p}" for p in problems))
+    return [int(counts[name]) for name in planes]
+
+
+def _is_count(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and int(value) >= 1

@@ -137,11 +137,15 @@ def load_truth(path: str | Path) -> Cell:
         raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
     if not isinstance(data, dict) or data.get("format") != TRUTH_FORMAT:
         raise DataError(f"{path}: expected a mapping with format {TRUTH_FORMAT!r}")
+    problems: list[str] = []
+    cell = None
     try:
-        return CellModel.model_validate(data).build_cell(f"{path}: ")
+        cell = CellModel.model_validate(data).build_cell("", problems)
     except ValidationError as error:
-        problems = validation_problems(error, CellModel)
-        raise DataError(*(f"{path}: {dotted(at)}: {text}" for at, text in problems)) from None
+        problems += [f"{dotted(at)}: {text}" for at, text in validation_problems(error, CellModel)]
+    if cell is None:
+        raise DataError(*(f"{path}: {text}" for text in problems))
+    return cell
 
 
 def _patterns(pictures: PictureOptions | None) -> dict[str, Any] | None:

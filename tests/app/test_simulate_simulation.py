@@ -220,6 +220,7 @@ def test_any_cell_any_part():
         (lambda: simulate(design="close"), "'close' is unknown; choose one of paper, near, mid"),
         (lambda: simulate(groups=0), "groups on plane '1'"),
         (lambda: simulate(shots=0), "shots"),
+        (lambda: simulate(groups=2.5), "groups on plane '1'.*2.5"),
         (lambda: simulate_cell(paper_cell(1), ["2"]), r"plane '2' .* which has \['1'\]"),
         (lambda: simulate_cell(paper_cell(1), ["1", "1"]), "named twice"),
         (lambda: simulate_cell(paper_cell(1), []), "no plane"),
