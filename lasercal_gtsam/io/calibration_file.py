@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import lasercal_gtsam
-from lasercal_gtsam.calibration import Calibration, Inputs
+from lasercal_gtsam.calibration import Calibration, Inputs, SpotResults
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.files import read_text, write_text
 from lasercal_gtsam.io.plain import cell_to_dict, observations_to_dict, plain, to_json
@@ -53,7 +54,7 @@ def to_dict(
             "matrix": plain(calibration.covariance),
         },
         "fit": plain(calibration.fit),
-        "spots": [plain(spot) for spot in calibration.spots],
+        "spots": _spots(calibration.spots),
         "observability": plain(calibration.observability),
         "initial": cell_to_dict(calibration.initial),
         "inputs": inputs,
@@ -136,6 +137,13 @@ def _read_json(path: Path) -> Any:
             + ("; use a newer lasercal-gtsam" if newer else "")
         )
     return data
+
+
+def _spots(spots: SpotResults) -> list[dict[str, Any]]:
+    """One mapping a spot, with the keys in the order of the fields."""
+    names = [f.name for f in fields(spots)]
+    columns = [plain(getattr(spots, name)) for name in names]
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def _inputs(inputs: Inputs) -> dict[str, Any]:

@@ -99,18 +99,40 @@ def observations_to_dict(observations: Observations) -> dict[str, Any]:
 
 def to_json(value: Any, indent: int = 0) -> str:
     """JSON for people: short things and rows of numbers on one line, the rest indented."""
-    compact = json.dumps(value, allow_nan=False, ensure_ascii=False)
+    items = value.values() if isinstance(value, dict) else value
     nested = isinstance(value, dict) or (
-        isinstance(value, list) and any(isinstance(item, dict | list) for item in value)
+        isinstance(value, list) and any(isinstance(item, dict | list) for item in items)
     )
-    if not nested or len(compact) + indent <= _LINE_LENGTH:
-        return compact
+    if not nested:
+        return _encode(value)
+    if _is_short(value):
+        compact = _encode(value)
+        if len(compact) + indent <= _LINE_LENGTH:
+            return compact
     pad, close = " " * (indent + 1), " " * indent
+    lines = [pad + to_json(item, indent + 1) for item in items]
     if isinstance(value, dict):
-        items = [
-            f"{json.dumps(key, ensure_ascii=False)}: {to_json(item, indent + 1)}"
-            for key, item in value.items()
-        ]
-        return "{\n" + ",\n".join(pad + item for item in items) + f"\n{close}}}"
-    items = [to_json(item, indent + 1) for item in value]
-    return "[\n" + ",\n".join(pad + item for item in items) + f"\n{close}]"
+        keys = [f"{pad}{_encode(key)}: " for key in value]
+        lines = [key + line.lstrip(" ") for key, line in zip(keys, lines, strict=True)]
+        return "{\n" + ",\n".join(lines) + f"\n{close}}}"
+    return "[\n" + ",\n".join(lines) + f"\n{close}]"
+
+
+_encode = json.JSONEncoder(allow_nan=False, ensure_ascii=False).encode
+
+
+def _is_short(value: Any) -> bool:
+    """Whether it can fit on a line at all; spares writing large things twice."""
+    todo, seen = [value], 0
+    while todo:
+        item = todo.pop()
+        seen += 1
+        if seen > _LINE_LENGTH // 2:
+            return False
+        if isinstance(item, dict):
+            todo += item.values()
+        elif isinstance(item, list):
+            if len(item) > _LINE_LENGTH // 2:
+                return False
+            todo += item
+    return True
