@@ -32,6 +32,8 @@ from numba import njit
 
 LOSS_NONE, LOSS_HUBER, LOSS_CAUCHY, LOSS_GEMAN_MCCLURE = 0, 1, 2, 3
 COLUMNS = 23
+# columns padded to an even number, and rows of a panel that stays in the first-level cache
+_PADDED, _PANEL = 24, 128
 
 _jit = njit(cache=True, nogil=True, error_model="numpy")
 
@@ -39,11 +41,11 @@ _jit = njit(cache=True, nogil=True, error_model="numpy")
 @_jit
 def loss_value(kind: int, c: float, m: float) -> float:
     """Robust loss of the squared whitened residual length ``m``; equals ``m`` for small ``m``."""
-    if kind == 1:
+    if kind == LOSS_HUBER:
         return m if m <= c * c else 2.0 * c * math.sqrt(m) - c * c
-    if kind == 2:
+    if kind == LOSS_CAUCHY:
         return c * c * math.log1p(m / (c * c))
-    if kind == 3:
+    if kind == LOSS_GEMAN_MCCLURE:
         return m * c * c / (c * c + m)
     return m
 
@@ -51,11 +53,11 @@ def loss_value(kind: int, c: float, m: float) -> float:
 @_jit
 def loss_weight(kind: int, c: float, m: float) -> float:
     """Derivative of `loss_value`: the weight of the spot."""
-    if kind == 1:
+    if kind == LOSS_HUBER:
         return 1.0 if m <= c * c else c / math.sqrt(m)
-    if kind == 2:
+    if kind == LOSS_CAUCHY:
         return 1.0 / (1.0 + m / (c * c))
-    if kind == 3:
+    if kind == LOSS_GEMAN_MCCLURE:
         w = c * c / (c * c + m)
         return w * w
     return 1.0
@@ -73,18 +75,18 @@ def _beam_in_hand(R, t, l):  # type: ignore[no-untyped-def]  # noqa: E741
 
 
 @_jit
-def _residual(uv, Rh, th, u, q, n, d, Rc, tc, K):  # type: ignore[no-untyped-def]
+def _residual(k, uv, Rh, th, u, q, n, d, Rc, tc, K):  # type: ignore[no-untyped-def]
     """(ok, du, dv): predicted minus seen pixel (8), (9), (1)-(3); not ok: no spot can be there.
 
     Not ok means: beam parallel to or away from the plane, spot behind the camera, or beyond the
     radius where the radial distortion turns back on itself.
     """
-    b0 = Rh[0, 0] * u[0] + Rh[0, 1] * u[1] + Rh[0, 2] * u[2]
-    b1 = Rh[1, 0] * u[0] + Rh[1, 1] * u[1] + Rh[1, 2] * u[2]
-    b2 = Rh[2, 0] * u[0] + Rh[2, 1] * u[1] + Rh[2, 2] * u[2]
-    x0 = Rh[0, 0] * q[0] + Rh[0, 1] * q[1] + Rh[0, 2] * q[2] + th[0]
-    x1 = Rh[1, 0] * q[0] + Rh[1, 1] * q[1] + Rh[1, 2] * q[2] + th[1]
-    x2 = Rh[2, 0] * q[0] + Rh[2, 1] * q[1] + Rh[2, 2] * q[2] + th[2]
+    b0 = Rh[k, 0, 0] * u[0] + Rh[k, 0, 1] * u[1] + Rh[k, 0, 2] * u[2]
+    b1 = Rh[k, 1, 0] * u[0] + Rh[k, 1, 1] * u[1] + Rh[k, 1, 2] * u[2]
+    b2 = Rh[k, 2, 0] * u[0] + Rh[k, 2, 1] * u[1] + Rh[k, 2, 2] * u[2]
+    x0 = Rh[k, 0, 0] * q[0] + Rh[k, 0, 1] * q[1] + Rh[k, 0, 2] * q[2] + th[k, 0]
+    x1 = Rh[k, 1, 0] * q[0] + Rh[k, 1, 1] * q[1] + Rh[k, 1, 2] * q[2] + th[k, 1]
+    x2 = Rh[k, 2, 0] * q[0] + Rh[k, 2, 1] * q[1] + Rh[k, 2, 2] * q[2] + th[k, 2]
     s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) / (n[0] * b0 + n[1] * b1 + n[2] * b2)
     x0 += s * b0 - tc[0]
     x1 += s * b1 - tc[1]
@@ -98,19 +100,22 @@ def _residual(uv, Rh, th, u, q, n, d, Rc, tc, K):  # type: ignore[no-untyped-def
     xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
     ok = s > 0.0 and z > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
-    return ok, K[0] * xd + K[2] * yd + K[3] - uv[0], K[1] * yd + K[4] - uv[1]
+    return ok, K[0] * xd + K[2] * yd + K[3] - uv[k, 0], K[1] * yd + K[4] - uv[k, 1]
 
 
 @_jit
-def _row(uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J):  # type: ignore[no-untyped-def]
-    """Fill the whitened 2x23 row ``J`` of one spot (method: chain rule); False as in `_residual`."""
+def _row(k, uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J, r):  # type: ignore[no-untyped-def]
+    """Fill columns r, r+1 of ``J`` (23, ...) with the two whitened rows of spot k, by the chain rule.
+
+    False as in `_residual`.
+    """
     # beam in base and its hit on the plane (8), (9)
-    b0 = Rh[0, 0] * u[0] + Rh[0, 1] * u[1] + Rh[0, 2] * u[2]
-    b1 = Rh[1, 0] * u[0] + Rh[1, 1] * u[1] + Rh[1, 2] * u[2]
-    b2 = Rh[2, 0] * u[0] + Rh[2, 1] * u[1] + Rh[2, 2] * u[2]
-    x0 = Rh[0, 0] * q[0] + Rh[0, 1] * q[1] + Rh[0, 2] * q[2] + th[0]
-    x1 = Rh[1, 0] * q[0] + Rh[1, 1] * q[1] + Rh[1, 2] * q[2] + th[1]
-    x2 = Rh[2, 0] * q[0] + Rh[2, 1] * q[1] + Rh[2, 2] * q[2] + th[2]
+    b0 = Rh[k, 0, 0] * u[0] + Rh[k, 0, 1] * u[1] + Rh[k, 0, 2] * u[2]
+    b1 = Rh[k, 1, 0] * u[0] + Rh[k, 1, 1] * u[1] + Rh[k, 1, 2] * u[2]
+    b2 = Rh[k, 2, 0] * u[0] + Rh[k, 2, 1] * u[1] + Rh[k, 2, 2] * u[2]
+    x0 = Rh[k, 0, 0] * q[0] + Rh[k, 0, 1] * q[1] + Rh[k, 0, 2] * q[2] + th[k, 0]
+    x1 = Rh[k, 1, 0] * q[0] + Rh[k, 1, 1] * q[1] + Rh[k, 1, 2] * q[2] + th[k, 1]
+    x2 = Rh[k, 2, 0] * q[0] + Rh[k, 2, 1] * q[1] + Rh[k, 2, 2] * q[2] + th[k, 2]
     inu = 1.0 / (n[0] * b0 + n[1] * b1 + n[2] * b2)
     s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) * inu
     x0 += s * b0
@@ -128,34 +133,34 @@ def _row(uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J):  # type: ignore[no-unt
     g = 1.0 + r2 * (k1 + k2 * r2)
     xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
     yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    w00, w01, w11 = W[0], W[1], W[2]
-    du = fu * xd + sk * yd + K[3] - uv[0]
-    dv = fv * yd + K[4] - uv[1]
-    J[0, 22] = w00 * du + w01 * dv
-    J[1, 22] = w11 * dv
+    w00, w01, w11 = W[k, 0], W[k, 1], W[k, 2]
+    du = fu * xd + sk * yd + K[3] - uv[k, 0]
+    dv = fv * yd + K[4] - uv[k, 1]
+    J[22, r] = w00 * du + w01 * dv
+    J[22, r + 1] = w11 * dv
     # whitened pixel with respect to the distorted coordinates, M = W [[fu, sk], [0, fv]]
     m00, m01, m11 = w00 * fu, w00 * sk + w01 * fv, w11 * fv
     # intrinsics
-    J[0, 6] = w00 * xd
-    J[1, 6] = 0.0
-    J[0, 7] = w01 * yd
-    J[1, 7] = w11 * yd
-    J[0, 8] = w00 * yd
-    J[1, 8] = 0.0
-    J[0, 9] = w00
-    J[1, 9] = 0.0
-    J[0, 10] = w01
-    J[1, 10] = w11
-    J[0, 11] = (m00 * x + m01 * y) * r2
-    J[1, 11] = m11 * y * r2
-    J[0, 12] = J[0, 11] * r2
-    J[1, 12] = J[1, 11] * r2
+    J[6, r] = w00 * xd
+    J[6, r + 1] = 0.0
+    J[7, r] = w01 * yd
+    J[7, r + 1] = w11 * yd
+    J[8, r] = w00 * yd
+    J[8, r + 1] = 0.0
+    J[9, r] = w00
+    J[9, r + 1] = 0.0
+    J[10, r] = w01
+    J[10, r + 1] = w11
+    J[11, r] = (m00 * x + m01 * y) * r2
+    J[11, r + 1] = m11 * y * r2
+    J[12, r] = J[11, r] * r2
+    J[12, r + 1] = J[11, r + 1] * r2
     a, b = 2.0 * x * y, r2 + 2.0 * y * y
-    J[0, 13] = m00 * a + m01 * b
-    J[1, 13] = m11 * b
+    J[13, r] = m00 * a + m01 * b
+    J[13, r + 1] = m11 * b
     b = r2 + 2.0 * x * x
-    J[0, 14] = m00 * b + m01 * a
-    J[1, 14] = m11 * a
+    J[14, r] = m00 * b + m01 * a
+    J[14, r + 1] = m11 * a
     # point in the camera: N = M d(xd, yd)/d(x, y), then d(x, y)/dp
     dg = k1 + 2.0 * k2 * r2
     d00 = g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x
@@ -168,32 +173,32 @@ def _row(uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J):  # type: ignore[no-unt
             n0, n1 = m11 * d01 * iz, m11 * d11 * iz
         n2 = -(n0 * x + n1 * y)
         # camera pose: dp = [p]x w - v (right perturbation, as Pose3)
-        J[i, 0] = n1 * pz - n2 * py
-        J[i, 1] = n2 * px - n0 * pz
-        J[i, 2] = n0 * py - n1 * px
-        J[i, 3] = -n0
-        J[i, 4] = -n1
-        J[i, 5] = -n2
+        J[0, r + i] = n1 * pz - n2 * py
+        J[1, r + i] = n2 * px - n0 * pz
+        J[2, r + i] = n0 * py - n1 * px
+        J[3, r + i] = -n0
+        J[4, r + i] = -n1
+        J[5, r + i] = -n2
         # point in the base
         g0 = Rc[0, 0] * n0 + Rc[0, 1] * n1 + Rc[0, 2] * n2
         g1 = Rc[1, 0] * n0 + Rc[1, 1] * n1 + Rc[1, 2] * n2
         g2 = Rc[2, 0] * n0 + Rc[2, 1] * n1 + Rc[2, 2] * n2
         along = (g0 * b0 + g1 * b1 + g2 * b2) * inu
         # plane: dX = u/nu (-X.dn + dd); GTSAM's offset is -d
-        J[i, 19] = -along * (x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0])
-        J[i, 20] = -along * (x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1])
-        J[i, 21] = -along
+        J[19, r + i] = -along * (x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0])
+        J[20, r + i] = -along * (x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1])
+        J[21, r + i] = -along
         # beam: dX = (I - u n^T/nu) R_base_hand (dq + s du)
         g0 -= along * n[0]
         g1 -= along * n[1]
         g2 -= along * n[2]
-        h0 = g0 * Rh[0, 0] + g1 * Rh[1, 0] + g2 * Rh[2, 0]
-        h1 = g0 * Rh[0, 1] + g1 * Rh[1, 1] + g2 * Rh[2, 1]
-        h2 = g0 * Rh[0, 2] + g1 * Rh[1, 2] + g2 * Rh[2, 2]
-        J[i, 17] = h0 * Rl[0, 0] + h1 * Rl[1, 0] + h2 * Rl[2, 0]
-        J[i, 18] = h0 * Rl[0, 1] + h1 * Rl[1, 1] + h2 * Rl[2, 1]
-        J[i, 15] = s * J[i, 17]
-        J[i, 16] = s * J[i, 18]
+        h0 = g0 * Rh[k, 0, 0] + g1 * Rh[k, 1, 0] + g2 * Rh[k, 2, 0]
+        h1 = g0 * Rh[k, 0, 1] + g1 * Rh[k, 1, 1] + g2 * Rh[k, 2, 1]
+        h2 = g0 * Rh[k, 0, 2] + g1 * Rh[k, 1, 2] + g2 * Rh[k, 2, 2]
+        J[17, r + i] = h0 * Rl[0, 0] + h1 * Rl[1, 0] + h2 * Rl[2, 0]
+        J[18, r + i] = h0 * Rl[0, 1] + h1 * Rl[1, 1] + h2 * Rl[2, 1]
+        J[15, r + i] = s * J[17, r + i]
+        J[16, r + i] = s * J[18, r + i]
     return s > 0.0 and pz > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
 
 
@@ -229,11 +234,9 @@ def residuals(uv, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K, beam_R,
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
         for k in range(blocks[m, 3], blocks[m, 4]):
-            ok, du, dv = _residual(
-                uv[k], R_base_hand[k], t_base_hand[k], u, q, plane_n[p], plane_d[p],
-                cam_R[c], cam_t[c], cam_K[c],
-            )  # fmt: skip
+            ok, du, dv = _residual(k, uv, R_base_hand, t_base_hand, u, q, n, d, Rc, tc, K)
             out[k, 0] = du if ok else np.nan
             out[k, 1] = dv if ok else np.nan
     return out
@@ -247,13 +250,11 @@ def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, ca
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
         for k in range(blocks[m, 3], blocks[m, 4]):
             if whitening[k, 2] == 0.0:
                 continue
-            ok, du, dv = _residual(
-                uv[k], R_base_hand[k], t_base_hand[k], u, q, plane_n[p], plane_d[p],
-                cam_R[c], cam_t[c], cam_K[c],
-            )  # fmt: skip
+            ok, du, dv = _residual(k, uv, R_base_hand, t_base_hand, u, q, n, d, Rc, tc, K)
             if not ok:
                 return np.inf
             e0 = whitening[k, 0] * du + whitening[k, 1] * dv
@@ -266,54 +267,75 @@ def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, ca
 def rows(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
          beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
     """Whitened Jacobian and residual of every spot, (N, 2, 23); NaN where no spot can be."""
-    out = np.empty((len(uv), 2, 23))
+    out = np.full((len(uv), 2, COLUMNS), np.nan)
+    J = np.empty((COLUMNS, 2))
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        B = tangent_basis(plane_n[p])
+        B, Rl = tangent_basis(plane_n[p]), beam_R[l]
+        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
         for k in range(blocks[m, 3], blocks[m, 4]):
-            ok = _row(
-                uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
-                plane_n[p], B, plane_d[p], cam_R[c], cam_t[c], cam_K[c], out[k],
-            )  # fmt: skip
-            if not ok:
-                out[k] = np.nan
+            if _row(k, uv, whitening, R_base_hand, t_base_hand, u, q, Rl, n, B, d, Rc, tc, K, J, 0):
+                out[k] = J.T
     return out
 
 
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
+def _add_products(Q, m, S):  # type: ignore[no-untyped-def]
+    """Add ``Q Q^T`` of the first m columns to ``S`` (24, 24), upper 2x2 blocks."""
+    for i in range(0, _PADDED, 2):
+        for j in range(i, _PADDED, 2):
+            s00 = s01 = s10 = s11 = 0.0
+            for k in range(m):
+                a, b, c, d = Q[i, k], Q[i + 1, k], Q[j, k], Q[j + 1, k]
+                s00 += a * c
+                s01 += a * d
+                s10 += b * c
+                s11 += b * d
+            S[i, j] += s00
+            S[i, j + 1] += s01
+            S[i + 1, j] += s10
+            S[i + 1, j + 1] += s11
+
+
 @_jit
-def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam_R, cam_t, cam_K,
-                beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n_all, cam_R, cam_t,
+                cam_K, beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
     """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
+    Rows are collected in panels that fit the cache, transposed, and multiplied panel by panel.
     """
-    H = np.zeros((n + 1, n + 1))
-    J = np.empty((2, 23))
-    local = np.empty((23, 23))
-    column = np.empty(23, np.int64)
+    H = np.zeros((n_all + 1, n_all + 1))
+    Q = np.zeros((_PADDED, _PANEL))
+    S = np.empty((_PADDED, _PADDED))
+    column = np.empty(COLUMNS, np.int64)
     for m in range(len(blocks)):
         c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        B = tangent_basis(plane_n[p])
-        local[:] = 0.0
+        B, Rl = tangent_basis(plane_n[p]), beam_R[l]
+        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
+        S[:] = 0.0
+        r = 0
         for k in range(blocks[m, 3], blocks[m, 4]):
             if whitening[k, 2] == 0.0:
                 continue
-            ok = _row(
-                uv[k], whitening[k], R_base_hand[k], t_base_hand[k], u, q, beam_R[l],
-                plane_n[p], B, plane_d[p], cam_R[c], cam_t[c], cam_K[c], J,
-            )  # fmt: skip
-            if not ok:
+            if not _row(
+                k, uv, whitening, R_base_hand, t_base_hand, u, q, Rl, n, B, d, Rc, tc, K, Q, r
+            ):
                 H[0, 0] = np.nan
                 return H
-            w = 1.0
-            if kind != 0:
-                w = loss_weight(kind, c_loss, J[0, 22] * J[0, 22] + J[1, 22] * J[1, 22])
-            for i in range(23):
-                a, b = w * J[0, i], w * J[1, i]
-                for j in range(i, 23):
-                    local[i, j] += a * J[0, j] + b * J[1, j]
+            if kind != LOSS_NONE:
+                e0, e1 = Q[COLUMNS - 1, r], Q[COLUMNS - 1, r + 1]
+                w = math.sqrt(loss_weight(kind, c_loss, e0 * e0 + e1 * e1))
+                for i in range(COLUMNS):
+                    Q[i, r] *= w
+                    Q[i, r + 1] *= w
+            r += 2
+            if r == _PANEL:
+                _add_products(Q, r, S)
+                r = 0
+        _add_products(Q, r, S)
         for i in range(6):
             column[i] = offsets[m, 0] + i
         for i in range(9):
@@ -322,14 +344,14 @@ def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam
             column[15 + i] = offsets[m, 2] + i
         for i in range(3):
             column[19 + i] = offsets[m, 3] + i
-        column[22] = n
-        for i in range(23):
-            for j in range(i, 23):
+        column[COLUMNS - 1] = n_all
+        for i in range(COLUMNS):
+            for j in range(i, COLUMNS):
                 a, b = column[i], column[j]
                 if a <= b:
-                    H[a, b] += local[i, j]
+                    H[a, b] += S[i, j]
                 else:
-                    H[b, a] += local[i, j]
+                    H[b, a] += S[i, j]
     return H
 
 
