@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 import reference
-from lasercal_factors import kernels
+from lasercal_factors.spot import SpotBatch, State
 from scipy.spatial.transform import Rotation
 
 from lasercal_gtsam import Beam, Camera, Cell, Intrinsics, Plane, project
@@ -47,6 +48,11 @@ def scene(beam: str, normal: str) -> tuple[reference.Spots, reference.State, np.
     return reference.Spots(R, t, uv), state, basis_of(n)
 
 
+def hand_poses(spots: reference.Spots) -> np.ndarray:
+    pairs = zip(spots.R_base_hand, spots.t_base_hand, strict=True)
+    return np.array([make_pose(R, t) for R, t in pairs])
+
+
 @pytest.mark.parametrize("normal", NORMALS)
 @pytest.mark.parametrize("beam", BEAMS)
 def test_reference_predicts_what_the_readable_projection_predicts(beam: str, normal: str) -> None:
@@ -56,10 +62,7 @@ def test_reference_predicts_what_the_readable_projection_predicts(beam: str, nor
     pose = make_pose(state.R_base_camera, state.t_base_camera)
     camera = Camera(Intrinsics.from_vector(state.intrinsics), pose, (640, 480))
     cell = Cell({"c": camera}, {"l": line}, {"p": Plane(state.normal, float(state.distance))})
-    poses = np.array(
-        [make_pose(R, t) for R, t in zip(spots.R_base_hand, spots.t_base_hand, strict=True)]
-    )
-    expected = project(cell, poses) - spots.uv
+    expected = project(cell, hand_poses(spots)) - spots.uv
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(reference.residual(spots, state), expected, rtol=0, atol=1e-10)
 
@@ -84,21 +87,20 @@ def test_reference_derivative_is_that_of_finite_steps() -> None:
 @pytest.mark.parametrize("normal", NORMALS)
 @pytest.mark.parametrize("beam", BEAMS)
 def test_kernel_rows_are_the_reference_derivative(beam: str, normal: str) -> None:
-    spots, state, basis = scene(beam, normal)
+    spots, state, _ = scene(beam, normal)
     count = len(spots.uv)
     W = np.array([[1.3, -0.4], [0.0, 0.7]])
-    rows = kernels.rows(
+    batch = SpotBatch.from_arrays(
         spots.uv,
-        np.tile([W[0, 0], W[0, 1], W[1, 1]], (count, 1)),
-        spots.R_base_hand,
-        spots.t_base_hand,
-        np.array([[0, 0, 0, 0, count]]),
-        *(np.ascontiguousarray(x)[None] for x in state[:7]),
-        np.atleast_1d(state.distance),
+        np.tile(np.linalg.inv(W.T @ W), (count, 1, 1)),
+        hand_poses(spots),
+        *np.zeros((3, count), dtype=int),
     )
+    rows = batch.rows(State(*(np.array(x)[None] for x in state)))
+    basis = gtsam.Unit3(state.normal).basis()
     expected = W @ reference.jacobian_complex_step(spots, state, basis)
     expected[..., 21] *= -1  # the kernel's offset is GTSAM's: n . x + d = 0
     error = np.abs(rows[..., :22] - expected).max(axis=(0, 1)) / np.abs(expected).max(axis=(0, 1))
     assert error.max() < 1e-13
-    seen = reference.residual(spots, state) @ W.T
-    np.testing.assert_allclose(rows[..., 22], seen, rtol=0, atol=1e-10)
+    residual = reference.residual(spots, state) @ W.T
+    np.testing.assert_allclose(rows[..., 22], residual, rtol=0, atol=1e-10)
