@@ -144,6 +144,8 @@ class Capture(FrozenData):
         """
         if account is None:
             account = self.detections(detector, progress)
+        elif list(account.ids) != self.ids.tolist():
+            raise DataError(f"{self.path}: the account is that of another capture (other ids)")
         rows = np.flatnonzero(account.usable)
         if not len(rows):
             reasons = [f"id {name}: {why}" for name, why in account.skipped.items()]

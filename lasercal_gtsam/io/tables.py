@@ -183,7 +183,7 @@ def read_table(path: Path, name: str | None = None) -> Table:
     )
     if not body:
         table.add_file_problem("there are column names but no rows")
-    for text in _header_problems(names, [cells for _, cells in whole]):
+    for text in _repeated_columns(names):
         table.add_problem_in_line(header_line, text)
     for line, cells in body:
         if len(cells) != len(header):
@@ -218,15 +218,9 @@ def _check_separator(header: list[str], where: str) -> None:
         raise DataError(f"{where}: expected column names, got numbers: {some(header)}")
 
 
-def _header_problems(names: list[str], rows: list[list[str]]) -> list[str]:
-    problems = [
+def _repeated_columns(names: list[str]) -> list[str]:
+    return [
         f"column {column!r} is there {count} times"
         for column, count in Counter(names).items()
         if column and count > 1
     ]
-    problems += [
-        f"column {k + 1} has no name"
-        for k, column in enumerate(names)
-        if not column and any(cells[k].strip() for cells in rows)
-    ]
-    return problems

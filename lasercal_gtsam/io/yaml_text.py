@@ -32,7 +32,8 @@ def read_yaml(path: Path) -> tuple[Any, Lines, list[tuple[Location, str]]]:
     -------
     data : plain dicts, lists, strings and numbers
     lines : where each key stands
-    problems : keys that are there twice, as (location, text); the last value is in ``data``
+    problems : keys that are there twice, as (location, text); the first value is in
+        ``data``
 
     Raises
     ------
