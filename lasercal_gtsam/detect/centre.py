@@ -1,73 +1,29 @@
-"""Sub-pixel centre of a spot: a speckle-aware Gaussian fit, guarded by a plain centroid.
+"""Sub-pixel centre of a spot by a speckle-aware Gaussian fit.
 
 With speckle the standard deviation of a pixel is in proportion to its light, so the fit's weights
 are ``1 / (noise^2 + (c model)^2)`` with ``c`` from the residuals (iteratively re-weighted least
-squares). A fit can run away on a spot that is no Gaussian; it is kept in a trust region and against
-the centroid of what lies above 20 % of the peak.
+squares).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from lasercal_gtsam.detect import gaussian
-from lasercal_gtsam.detect.candidates import FINE, Candidate
 from lasercal_gtsam.detect.difference import Image
-from lasercal_gtsam.detect.gaussian import Mask, Trust, Window
+from lasercal_gtsam.detect.gaussian import Trust, Window
+from lasercal_gtsam.detect.region import Region, squared_distance
 from lasercal_gtsam.frozen import Array
 
-LEVEL = 0.2  # of the peak: contour of the region and threshold of the centroid
-# a Gaussian's region above LEVEL is an ellipse of semi-axes sigma sqrt(2 ln 5), whose second
-# moment is a quarter of their squares
-_REGION_MOMENT = 0.5 * np.log(1 / LEVEL)
 CORE = 0.1  # of the fitted peak: pixels that tell of speckle
-_WINDOW_SIGMAS = 3.5
 # of the peak: how well a spot's profile is a Gaussian at best; keeps faint skirts from ruling the
 # fit of a bright spot
 PROFILE_ERROR = 0.01
-_MIN_SIGMA = 0.35
+_WINDOW_SIGMAS = 3.5
 _ROUNDS = 4
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """The connected pixels above 20 % of the peak, with moments of the light in it.
-
-    ``box`` is (u0, v0, width, height) in the picture, ``mask`` (height, width) inside it.
-    """
-
-    box: tuple[int, int, int, int]
-    mask: Mask
-    area: int
-    centroid: Array
-    shape: Array
-
-
-def find_region(blurred: Image, candidate: Candidate) -> Region:
-    """Pixels of the blurred difference above 20 % of the candidate's peak that connect to it."""
-    above = (blurred > LEVEL * candidate.peak).view(np.uint8)
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(above, connectivity=8)
-    label = int(labels[candidate.v, candidate.u])
-    u0, v0, width, height, area = (int(x) for x in stats[label])
-    part = (slice(v0, v0 + height), slice(u0, u0 + width))
-    mask = labels[part] == label
-    v, u = np.nonzero(mask)
-    u, v = u + u0, v + v0
-    weight = blurred[part][mask].astype(np.float64) - LEVEL * candidate.peak
-    total = weight.sum()
-    centroid = np.array([weight @ u, weight @ v]) / total
-    flat = np.cov(np.stack([u, v]), bias=True) if area > 1 else np.zeros((2, 2))
-    # moments of the region, without the blur and the pixels' own size
-    shape = flat / _REGION_MOMENT - FINE**2 * np.eye(2)
-    return Region((u0, v0, width, height), mask, area, centroid, _at_least(shape, _MIN_SIGMA))
-
-
-def _at_least(shape: Array, sigma: float) -> Array:
-    values, axes = np.linalg.eigh(shape)
-    return np.asarray((axes * np.maximum(values, sigma**2)) @ axes.T)
+_STEPS = 30  # at most, of one round
 
 
 def cut_window(light: Image, variance: Image, centre: Array, shape: Array) -> Window:
@@ -86,13 +42,6 @@ def cut_window(light: Image, variance: Image, centre: Array, shape: Array) -> Wi
         variance=variance[part][inside].astype(np.float64),
         inside=inside,
     )
-
-
-def squared_distance(u: Array, v: Array, centre: Array, shape: Array) -> Array:
-    """Mahalanobis distance, squared, of pixels from a spot."""
-    (a, b), (_, c) = np.linalg.inv(shape)
-    du, dv = u - centre[0], v - centre[1]
-    return np.asarray(a * du * du + 2 * b * du * dv + c * dv * dv)
 
 
 def aperture_centroid(window: Window, start: Array, shape: Array) -> Array:
@@ -144,10 +93,10 @@ def fit_spot(light: Image, variance: Image, region: Region) -> SpotFit:
     p, settled, speckle = start, False, 0.0
     weights = _weights(window, p, speckle)
     for _ in range(_ROUNDS):
-        p, settled = gaussian.fit(window, weights, p, trust, start, 30)
+        p, settled = gaussian.fit(window, weights, p, trust, start, _STEPS)
         speckle = speckle_contrast(window, p)
         weights = _weights(window, p, speckle)
-    p, settled = gaussian.fit(window, weights, p, trust, start, 30)
+    p, settled = gaussian.fit(window, weights, p, trust, start, _STEPS)
     return SpotFit(p, speckle, weights, settled, window)
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 Image = npt.NDArray[np.float32]
 
+_MATCH_SAMPLES = 15_000
 _SAMPLES = 40_000  # pixels that a global statistic is taken from
 _ALBEDO_BLUR = 0.8  # px; against the noise of the off frame
 _ALBEDO_RANGE = 4.0  # prints on one surface differ by less
@@ -96,20 +97,23 @@ def noise_sigma(image: Image, step: float = 0.0) -> float:
     columns = np.arange(0, image.shape[1] - 1, 2 * stride)
     top, bottom = image[rows], image[rows + 1]
     second = (top[:, columns] - top[:, columns + 1]) - (bottom[:, columns] - bottom[:, columns + 1])
-    return max(0.5 * clipped_sigma(second.ravel()), step / np.sqrt(12), 1e-12)
+    quantisation = float(step / np.sqrt(12))
+    return max(0.5 * clipped_sigma(second.ravel()), quantisation, 1e-12)
 
 
 def clipped_sigma(values: Image, clip: float = 3.0, rounds: int = 5) -> float:
     """Standard deviation about zero of a sample with outliers, clipped and corrected for it."""
     values = np.abs(values)
-    # start low, from the central half (MAD), at least a hair above zero for coarse integers
-    sigma = float(1.4826 * np.median(values)) or float(np.sqrt(np.mean(values * values)))
+    # start from the median of a few (rough, and quantised on integers), or where that is zero,
+    # from all
+    few = values[:: max(1, values.size // 2000)]
+    sigma = 1.4826 * float(np.median(few)) or float(np.sqrt(np.mean(values * values)))
     for _ in range(rounds):
         kept = values[values <= clip * sigma]
         if kept.size == 0:
             break
         # a Gaussian cut at 3 sigma keeps 0.9733 of its variance
-        new = float(np.sqrt(np.mean(kept * kept, dtype=np.float64) / 0.9733))
+        new = float(np.sqrt(float(kept @ kept) / kept.size / 0.9733))
         if abs(new - sigma) < 1e-3 * sigma:
             return new
         sigma = new
@@ -126,19 +130,20 @@ def _gradient(image: Image) -> tuple[Image, Image]:
 
 def _match(light: Image, off: Image, gx: Image, gy: Image) -> tuple[float, npt.NDArray[np.float64]]:
     """Lamp gain and camera shift between the frames by clipped least squares on a sample."""
-    stride = max(1, int(np.sqrt(light.size / _SAMPLES)))
+    stride = max(1, int(np.sqrt(light.size / _MATCH_SAMPLES)))
     part = (slice(None, None, stride), slice(None, None, stride))
-    A = np.stack([off[part].ravel(), -gx[part].ravel(), -gy[part].ravel()], axis=1)
-    A, y = A.astype(np.float64), light[part].ravel().astype(np.float64)
-    keep = np.ones(len(y), dtype=bool)
-    solution = np.zeros(3)
-    for _ in range(3):
-        normal = A[keep].T @ A[keep]
+    A = np.stack([off[part].ravel(), -gx[part].ravel(), -gy[part].ravel()])
+    y = light[part].ravel()
+    keep = np.ones_like(y)
+    solution: npt.NDArray[np.float64] = np.zeros(3)
+    for _ in range(4):
+        kept = A * keep
+        normal, right = (kept @ A.T).astype(np.float64), (kept @ y).astype(np.float64)
         # a scene without light or without structure says nothing of gain or shift: stay at zero
-        ridge = 1e-9 * np.trace(normal) + 1e-12
-        solution = np.linalg.solve(normal + ridge * np.eye(3), A[keep].T @ y[keep])
-        residual = y - A @ solution
-        keep = np.abs(residual) <= 3 * clipped_sigma(residual.astype(np.float32)) + 1e-12
+        normal += (1e-6 * np.trace(normal) + 1e-12) * np.eye(3)
+        solution = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
+        residual = np.abs(y - solution.astype(np.float32) @ A)
+        keep = (residual <= 3 * clipped_sigma(residual)).astype(np.float32)
     return float(solution[0]), solution[1:]
 
 

@@ -8,66 +8,48 @@ import cv2
 import numpy as np
 
 from lasercal_gtsam.detect import gaussian
+from lasercal_gtsam.detect.background import measure_background
 from lasercal_gtsam.detect.candidates import FINE, Candidate
-from lasercal_gtsam.detect.centre import (
-    LEVEL,
-    Region,
-    SpotFit,
-    aperture_centroid,
-    find_region,
-    fit_spot,
-    squared_distance,
-)
-from lasercal_gtsam.detect.covariance import fit_covariance, saturation_variance
+from lasercal_gtsam.detect.centre import SpotFit, fit_spot
 from lasercal_gtsam.detect.difference import Difference, Image, Patch, cut_patch
 from lasercal_gtsam.detect.gaussian import Mask
+from lasercal_gtsam.detect.guard import CORE_LEVEL, Centre, choose_centre
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.detect.picture import Frames
+from lasercal_gtsam.detect.region import LEVEL, Region, find_region, squared_distance
 from lasercal_gtsam.frozen import Array
 
-# fit and centroid agree within the larger of these: pixels, and sigmas of the spot
-_AGREE_PX, _AGREE_SIGMAS = 0.4, 0.45
-_CLIPPED_SHARE = 0.5  # of the spot's pixels: above, the fit follows the flare
 RIVAL_SIGMAS = 2.5  # light beyond this is not the spot's own
+_CLIPPED_DIVIDE = 0.1  # of the spot's pixels
 _MARGIN = 12  # px of surroundings that are looked at beside the spot
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What is known of one candidate, before it is judged.
+    """What is known of one candidate, before it is judged; positions in the whole picture.
 
     Attributes
     ----------
-    uv, cov_uv, shape
-        Centre (2,), px; its covariance and that of the spot (2, 2), px^2.
-    method
-        ``fit`` or ``centroid``.
-    disagreement_px
-        Distance between fit and centroid.
+    centre
+        Centre with covariance, and the spot's shape.
     peak
         Height of the spot (pixel values).
-    n_saturated
-        Clipped pixels of the spot.
+    n_saturated, saturated_share
+        Clipped pixels of the spot, and per pixel above half of its peak.
     box, area
-        Bounding box (u0, v0, width, height) and number of pixels above 20 % of the peak after a
-        blur, and
+        Bounding box (u0, v0, width, height) and number of pixels above 20 % of the peak.
     bright_area
-        the same before it: a hot pixel has one.
+        The same without the blur that all else is seen through: a hot pixel has one.
     fill
-        Light at the centre over the most in the spot, after a blur.
-    beside
-        Strongest light beyond 2.5 sigma in the surroundings, over the peak, after a blur, and
-    beside_uv
-        where that is.
+        Light at the centre over the most in the spot.
+    beside, beside_uv
+        Strongest light beyond 2.5 sigma in the surroundings, over the spot's, and where.
     """
 
-    uv: Array
-    cov_uv: Array
-    shape: Array
-    method: str
-    disagreement_px: float
+    centre: Centre
     peak: float
     n_saturated: int
+    saturated_share: float
     box: tuple[int, int, int, int]
     area: int
     bright_area: int
@@ -83,34 +65,41 @@ def measure_spot(
     candidate: Candidate,
     options: DetectionOptions,
 ) -> Measurement:
-    """Measure the spot that a candidate stands for."""
-    whole = find_region(blurred, candidate)
-    margin = _MARGIN + int(3 * np.sqrt(np.linalg.eigvalsh(whole.shape)[1]))
-    patch = cut_patch(difference, whole.box, margin, options.black_level, options.divide_albedo)
-    corner = np.array(patch.corner, dtype=np.float64)
-    smooth = _smooth(patch.light)
-    region = find_region(smooth, _strongest(smooth, whole, patch))
-    spot = fit_spot(patch.light, patch.variance, region)
+    """Measure the spot that a candidate stands for.
 
-    saturated = _near(frames.saturated, patch, region)
-    uv, cov, method = _centre(spot, region, saturated, options.floor_px)
-    shape = spot.shape if method == "fit" else region.shape
-    beside, beside_uv = _light_beside(patch.light, spot)
-    u, v = (int(x) for x in np.clip(np.rint(uv), 0, np.array(smooth.shape[::-1]) - 1))
-    top = float(smooth[_slices(region)][region.mask].max())
+    Parameters
+    ----------
+    frames, difference : the pictures and the laser's light in them
+    blurred : the difference blurred by `FINE`
+    candidate : the blob to measure
+    options : for the albedo and the floor
+    """
+    whole = find_region(blurred, candidate)
+    n_saturated = int(np.count_nonzero(frames.saturated[_slices(whole)]))
+    reach = int(3 * np.sqrt(np.linalg.eigvalsh(whole.shape)[1])) + _MARGIN
+    # dividing a clipped plateau would only print the texture on it
+    divide = options.divide_albedo and n_saturated <= _CLIPPED_DIVIDE * whole.area
+    patch = cut_patch(difference, whole.box, reach, options.black_level, divide)
+    corner = np.array(patch.corner, dtype=np.float64)
+
+    smooth = _smooth(patch.light)
+    again = _strongest(smooth, whole, patch)
+    region, core = find_region(smooth, again), find_region(smooth, again, CORE_LEVEL)
+    background = measure_background(patch, region)
+    variance = np.asarray(patch.variance * background.excess, dtype=np.float32)
+    spot = fit_spot(patch.light, variance, region)
+    centre = choose_centre(spot, region, core, n_saturated, background, options.floor_px)
+    beside, beside_uv = _light_beside(patch.light, smooth, spot, centre)
     u0, v0, width, height = region.box
     return Measurement(
-        uv=uv + corner,
-        cov_uv=cov,
-        shape=shape,
-        method=method,
-        disagreement_px=float(np.linalg.norm(spot.uv - region.centroid)),
-        peak=float(spot.p[0]),
-        n_saturated=saturated,
+        centre=Centre(centre.uv + corner, centre.cov_uv, centre.shape, centre.method),
+        peak=float(spot.p[0]) if centre.method == "fit" else again.peak,
+        n_saturated=n_saturated,
+        saturated_share=n_saturated / core.area,
         box=(u0 + patch.corner[0], v0 + patch.corner[1], width, height),
         area=region.area,
         bright_area=_bright_area(patch.light, region),
-        fill=float(smooth[v, u]) / top,
+        fill=_at(smooth, centre.uv) / again.peak,
         beside=beside,
         beside_uv=beside_uv + corner,
     )
@@ -125,52 +114,41 @@ def _strongest(smooth: Image, whole: Region, patch: Patch) -> Candidate:
     return Candidate(left + int(u), top + int(v), float(inside[v, u]))
 
 
-def _centre(
-    spot: SpotFit, region: Region, saturated: int, floor_px: float
-) -> tuple[Array, Array, str]:
-    """Fit or centroid, with a covariance that knows of their disagreement."""
-    offset = spot.uv - region.centroid
-    aperture = aperture_centroid(spot.window, region.centroid, region.shape)
-    sigma = float(np.sqrt(np.linalg.eigvalsh(region.shape)[1]))
-    tolerance = max(_AGREE_PX, _AGREE_SIGMAS * sigma)
-    agrees = min(np.linalg.norm(offset), np.linalg.norm(spot.uv - aperture)) <= tolerance
-    trusted = spot.settled and agrees and saturated <= _CLIPPED_SHARE * region.area
-    share = 0.25 if trusted else 1.0
-    cov = fit_covariance(spot) + share * np.outer(offset, offset)
-    cov = cov + (floor_px**2 + saturation_variance(saturated)) * np.eye(2)
-    return (spot.uv, cov, "fit") if trusted else (region.centroid, cov, "centroid")
-
-
 def _slices(region: Region) -> tuple[slice, slice]:
     u0, v0, width, height = region.box
     return slice(v0, v0 + height), slice(u0, u0 + width)
 
 
-def _near(saturated: Mask, patch: Patch, region: Region) -> int:
-    """Clipped pixels in the spot's box."""
-    u0, v0, width, height = region.box
-    u0, v0 = u0 + patch.corner[0], v0 + patch.corner[1]
-    return int(np.count_nonzero(saturated[v0 : v0 + height, u0 : u0 + width]))
-
-
 def _bright_area(light: Image, region: Region) -> int:
     """Pixels that connect to the brightest one of the region above 20 % of it, without a blur."""
     inside = np.where(region.mask, light[_slices(region)], 0)
-    above = (inside > LEVEL * inside.max()).view(np.uint8)
-    _, labels = cv2.connectedComponents(above, connectivity=8)
-    brightest = labels.ravel()[int(np.argmax(inside))]
-    return int(np.count_nonzero(labels == brightest))
+    above: Mask = inside > LEVEL * inside.max()
+    _, labels = cv2.connectedComponents(above.view(np.uint8), connectivity=8)
+    return int(np.count_nonzero(labels == labels.ravel()[int(np.argmax(inside))]))
 
 
-def _light_beside(light: Image, spot: SpotFit) -> tuple[float, Array]:
-    """What the fitted spot leaves beyond 2.5 sigma: ratio of the peaks after a blur, and pixel."""
+def _at(image: Image, uv: Array) -> float:
+    """Pixel nearest to ``uv``."""
+    u, v = (int(x) for x in np.clip(np.rint(uv), 0, np.array(image.shape[::-1]) - 1))
+    return float(image[v, u])
+
+
+def _light_beside(
+    light: Image, smooth: Image, spot: SpotFit, centre: Centre
+) -> tuple[float, Array]:
+    """Strongest light beyond 2.5 sigma over the spot's own (both blurred), and its pixel.
+
+    What is left over by the fit, where that is trusted.
+    """
     v, u = np.mgrid[: light.shape[0], : light.shape[1]].astype(np.float64)
-    model = gaussian.value(spot.p, u.ravel(), v.ravel()).reshape(light.shape)
-    own = float(_smooth(np.asarray(model - spot.p[6], dtype=np.float32)).max())
-    rest = _smooth(np.asarray(light - model, dtype=np.float32))
-    rest[squared_distance(u, v, spot.uv, spot.shape) <= RIVAL_SIGMAS**2] = -np.inf
+    rest, own = smooth.copy(), _at(smooth, centre.uv)
+    if centre.method == "fit":
+        model = gaussian.value(spot.p, u.ravel(), v.ravel()).reshape(light.shape)
+        own = float(_smooth(np.asarray(model - spot.p[6], dtype=np.float32)).max())
+        rest = _smooth(np.asarray(light - model, dtype=np.float32))
+    rest[squared_distance(u, v, centre.uv, centre.shape) <= RIVAL_SIGMAS**2] = -np.inf
     y, x = np.unravel_index(int(np.argmax(rest)), rest.shape)
-    return max(float(rest[y, x]) / own, 0.0), np.array([float(x), float(y)])
+    return max(float(rest[y, x]) / max(own, 1e-12), 0.0), np.array([float(x), float(y)])
 
 
 def _smooth(image: Image) -> Image:

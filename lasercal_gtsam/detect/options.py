@@ -42,8 +42,10 @@ class DetectionOptions:
         Number of pixels above 20 % of the peak that a spot may have.
     max_elongation
         Largest ratio of the spot's axes.
-    max_saturated_px
-        Number of saturated pixels above which a spot is not used.
+    max_saturated_share
+        Number of saturated pixels over the number above half of the clipped peak, above which a
+        spot is not used. (0.9 is met at about 50 times the light that saturates; saturation below
+        the limit is in the covariance.)
     min_snr
         Peak over background noise below which a spot is not used.
     max_sigma_px
@@ -69,7 +71,7 @@ class DetectionOptions:
     min_area_px: int = 4
     max_area_px: int = 4000
     max_elongation: float = 8.0
-    max_saturated_px: int = 60
+    max_saturated_share: float = 0.9
     min_snr: float = 5.0
     max_sigma_px: float = 1.0
     floor_px: float = 0.02

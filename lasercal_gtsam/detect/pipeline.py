@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from lasercal_gtsam.detect.candidates import Candidate, find_candidates
-from lasercal_gtsam.detect.centre import squared_distance
 from lasercal_gtsam.detect.detection import Detection, RunnerUp
 from lasercal_gtsam.detect.difference import Difference, pair_difference, single_difference
 from lasercal_gtsam.detect.measure import RIVAL_SIGMAS, Measurement, measure_spot
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.detect.picture import Frames, read_frames
+from lasercal_gtsam.detect.region import squared_distance
 from lasercal_gtsam.detect.verdict import judge
 
 
@@ -58,9 +58,10 @@ def _rival(spot: Measurement, ranked: tuple[Candidate, ...]) -> RunnerUp | None:
     """The strongest light that is not the spot's own: another candidate, or a bulge beside it."""
     rivals = [RunnerUp(spot.beside_uv, spot.beside)] if spot.beside > 0 else []
     for other in ranked[1:]:
-        apart = squared_distance(np.array(other.u), np.array(other.v), spot.uv, spot.shape)
-        if apart > RIVAL_SIGMAS**2:
-            rivals.append(RunnerUp(np.array([other.u, other.v]), other.peak / ranked[0].peak))
+        at = np.array([other.u, other.v], dtype=np.float64)
+        apart = squared_distance(at[:1], at[1:], spot.centre.uv, spot.centre.shape)
+        if apart[0] > RIVAL_SIGMAS**2:
+            rivals.append(RunnerUp(at, other.peak / ranked[0].peak))
             break
     return max(rivals, key=lambda rival: rival.ratio, default=None)
 
@@ -88,13 +89,13 @@ def _detection(
     height, width = frames.on.shape
     single = frames.off is None
     verdict, reason = judge(spot, difference.noise, rival, (width, height), single, options)
-    variances, axes = np.linalg.eigh(spot.shape)
+    variances, axes = np.linalg.eigh(spot.centre.shape)
     angle = float(np.arctan2(axes[1, 1], axes[0, 1]))
     return Detection(
         verdict=verdict,
         reason=reason,
-        uv=spot.uv,
-        cov_uv=spot.cov_uv,
+        uv=spot.centre.uv,
+        cov_uv=spot.centre.cov_uv,
         peak=spot.peak,
         noise=difference.noise,
         snr=spot.peak / difference.noise,
@@ -104,6 +105,6 @@ def _detection(
         angle_rad=angle if -np.pi / 2 < angle <= np.pi / 2 else angle - np.sign(angle) * np.pi,
         channel=frames.channel,
         single_frame=single,
-        method=spot.method,
+        method=spot.centre.method,
         runner_up=rival,
     )

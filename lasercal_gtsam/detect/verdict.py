@@ -33,7 +33,7 @@ def judge(
     width, height = image_size
     margin = options.edge_margin_px
     u0, v0, w, h = spot.box
-    u, v = spot.uv
+    u, v = spot.centre.uv
     if u0 < margin or v0 < margin or u0 + w > width - margin or v0 + h > height - margin:
         return "edge", f"the spot at ({u:.0f}, {v:.0f}) reaches the edge of the picture"
     if options.region is not None:
@@ -49,16 +49,16 @@ def judge(
         return "too_large", (
             f"{spot.area} pixels above 20 % of the peak, more than {options.max_area_px}"
         )
-    minor, major = np.sqrt(np.linalg.eigvalsh(spot.shape))
+    minor, major = np.sqrt(np.linalg.eigvalsh(spot.centre.shape))
     if major > options.max_elongation * minor:
         return "elongated", (
             f"the axes are {major / minor:.1f} to 1, more than {options.max_elongation:g}: "
             "a line or a reflection?"
         )
-    if spot.n_saturated > options.max_saturated_px:
+    if spot.saturated_share > options.max_saturated_share:
         return "saturated", (
-            f"{spot.n_saturated} pixels are saturated, more than {options.max_saturated_px}: "
-            "expose less"
+            f"{spot.n_saturated} pixels are saturated, {spot.saturated_share:.0%} of the spot's "
+            "core: expose less"
         )
     if spot.peak < options.min_snr * noise:
         return "weak", f"peak over noise is {spot.peak / noise:.1f}, less than {options.min_snr:g}"
@@ -72,7 +72,7 @@ def judge(
         return "ambiguous", (
             f"the light at the centre is {spot.fill:.0%} of the spot's most: two spots that touch?"
         )
-    sigma = float(np.sqrt(np.linalg.eigvalsh(spot.cov_uv)[1]))
+    sigma = float(np.sqrt(np.linalg.eigvalsh(spot.centre.cov_uv)[1]))
     if sigma > options.max_sigma_px:
         return "uncertain", (
             f"the centre has a sigma of {sigma:.2f} px, more than {options.max_sigma_px:g}"

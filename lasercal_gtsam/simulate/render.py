@@ -452,7 +452,9 @@ def _expose(
     noise = np.sqrt(electrons + options.read_noise_e**2) * _normal(rng, light.shape)
     level = (electrons + noise) * (options.full_scale / options.full_well_e)
     level = np.clip(np.rint(level), 0, options.full_scale)
-    return level.astype(np.uint8) if options.bits == 8 else level.astype(np.uint16)
+    if options.bits == 8:
+        return np.asarray(level, dtype=np.uint8)
+    return np.asarray(level, dtype=np.uint16)
 
 
 def _normal(rng: np.random.Generator, shape: tuple[int, ...]) -> Image:
