@@ -79,7 +79,7 @@ def calibrate(
             },
         )
         start = holds.apply(candidates[0].cell)
-        solution = refine_candidates(search, candidates)
+        solution = refine_candidates(search, [candidate.cell for candidate in candidates])
     else:
         start = initial
         solution = refine_given(search, initial)

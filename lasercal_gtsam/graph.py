@@ -63,11 +63,7 @@ class CellGraph:
     def graph(self) -> gtsam.NonlinearFactorGraph:
         """Batch factor of all spots, and one factor with all priors."""
         graph = gtsam.NonlinearFactorGraph()
-        batch = (
-            self.batch
-            if self.scale == 1.0
-            else self.batch.weighted(np.full(len(self.batch), self.scale**-2.0))
-        )
+        batch = self.batch if self.scale == 1.0 else self.batch.scaled(self.scale)
         graph.add(LaserSpotBatchFactor(self.keys, batch, self.loss, self.holds.held))
         if self.holds.priors:
             graph.add(_prior_factor(self.keys, self.holds, self.start, self.charts))
@@ -102,8 +98,8 @@ class CellGraph:
 
     def spot_pixels(self, camera: int) -> Array:
         """Seen pixels of the camera with that index, (M, 2)."""
-        parts = [self.batch.uv[b[3] : b[4]] for b in self.batch.blocks if b[0] == camera]
-        return np.concatenate(parts) if parts else np.empty((0, 2))
+        parts = [self.batch.pixels[:2, b[3] : b[4]] for b in self.batch.blocks if b[0] == camera]
+        return np.concatenate(parts, axis=1).T if parts else np.empty((0, 2))
 
     def residuals(self, cell: Cell) -> Array:
         """Predicted minus seen pixel of each spot in input order, (N, 2); NaN where impossible."""

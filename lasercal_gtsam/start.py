@@ -12,7 +12,6 @@ import numpy as np
 from lasercal_factors.spot import Loss, SpotBatch
 
 from lasercal_gtsam.cell import Camera, Cell, Intrinsics
-from lasercal_gtsam.closed_form import Candidate
 from lasercal_gtsam.errors import DataError, LasercalError, SolveError
 from lasercal_gtsam.graph import CellGraph, make_graph
 from lasercal_gtsam.holds import Holds
@@ -80,9 +79,8 @@ def refine_given(search: Search, initial: Cell) -> Solution:
     direct = search.solve_from(initial)
     if direct is not None and direct.plausible:
         return direct
-    candidate = Candidate(initial, float("nan"), "given", 0.0)
     try:
-        return refine_candidates(search, [candidate], direct)
+        return refine_candidates(search, [initial], direct)
     except SolveError:
         # report why the start itself is impossible
         return solve(
@@ -92,9 +90,9 @@ def refine_given(search: Search, initial: Cell) -> Solution:
 
 
 def refine_candidates(
-    search: Search, candidates: Sequence[Candidate], also: Solution | None = None
+    search: Search, candidates: Sequence[Cell], also: Solution | None = None
 ) -> Solution:
-    """Best solution over the candidates (method 6.3 steps 3-5).
+    """Best solution over candidate starts, the likeliest first (method 6.3 steps 3-5).
 
     Raises
     ------
@@ -145,7 +143,7 @@ def fits_distortion(holds: Holds, cameras: int) -> bool:
     return not bool(holds.held[columns].all())
 
 
-def _short_refinements(search: Search, candidates: Sequence[Candidate]) -> list[Cell]:
+def _short_refinements(search: Search, candidates: Sequence[Cell]) -> list[Cell]:
     """Stages (a) without distortion and (b) with k1, weak priors; cheapest first, doubles dropped."""
     with_distortion = fits_distortion(search.holds, len(search.observations.cameras))
     priors = _stage_priors(search)
@@ -153,8 +151,8 @@ def _short_refinements(search: Search, candidates: Sequence[Candidate]) -> list[
     if with_distortion:
         stages.append(replace(search.holds.without_distortion(("k1",)), priors=priors))
     found: list[tuple[float, Cell]] = []
-    for candidate in candidates[:_SHORT_LIST]:
-        cell, cost = candidate.cell, np.inf
+    for cell in candidates[:_SHORT_LIST]:
+        cost = np.inf
         for holds in stages:
             result = _short(search, holds, cell)
             if result is None:
@@ -185,7 +183,7 @@ def _short(search: Search, holds: Holds, cell: Cell) -> tuple[Cell, float] | Non
 
 def _typical_sigma(search: Search) -> float:
     """Typical a-priori pixel sigma of the batch."""
-    return float(1.0 / np.median(search.batch.whitening[:, 2]))
+    return float(1.0 / np.median(search.batch.pixels[4]))
 
 
 def _stage_priors(search: Search) -> dict[str, tuple[float, float]]:

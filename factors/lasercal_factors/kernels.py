@@ -2,25 +2,26 @@
 
 Raw float64 arrays in SI units and pixels; no objects. Every function sees the spots sorted into
 *blocks*: the spots of one block share camera, laser and plane, so that the 22 unknowns a spot
-depends on are the same for the whole block.
+depends on are the same for the whole block. Spots are stored along the last axis, so that the loops
+run several spots at a time in the processor's vector units.
 
 Arrays of a batch
 -----------------
-uv (N, 2), R_base_hand (N, 3, 3), t_base_hand (N, 3)
-whitening (N, 3): ``w00, w01, w11`` of the upper triangle ``W`` with ``W.T @ W = inv(cov_uv)``; all
-zero for a spot that is left out
+pixels (5, N): seen pixel ``u, v`` and ``w00, w01, w11`` of the upper triangle ``W`` with
+``W.T @ W = inv(cov_uv)``
+hands (12, N): ``T_base_hand``, the rotation row by row (9), then the translation (3)
 blocks (M, 5): camera, laser, plane index, first spot, one past the last spot
 
 Arrays of a state (C cameras, L lasers, P planes)
 -------------------------------------------------
 cam_R (C, 3, 3), cam_t (C, 3): ``T_base_camera``; cam_K (C, 9): ``fu fv skew u0 v0 k1 k2 p1 p2``
-beam_R (L, 3, 3), beam_t (L, 3), beam_l (L, 4): constant frame and ``a, b, x, y``: the beam runs along
-``beam_R (a, b, 1)`` through ``beam_t + beam_R (x, y, 0)``, in hand coordinates
+beam_R (L, 3, 3), beam_t (L, 3), beam_l (L, 4): constant frame and ``a, b, x, y``: the beam runs
+along ``beam_R (a, b, 1)`` through ``beam_t + beam_R (x, y, 0)``, in hand coordinates
 plane_n (P, 3), plane_d (P,): ``n . x = d``
 
-Columns of a spot's row: camera pose 6 (rotation first, camera frame, as `gtsam.Pose3`), intrinsics 9,
-beam 4, plane 3 (normal 2, then the offset **as GTSAM stores it**, ``-d``), and the residual last.
-The residual is predicted minus seen pixel (paper, eq. 55), whitened.
+Columns of a spot's rows: camera pose 6 (rotation first, camera frame, as `gtsam.Pose3`), intrinsics
+9, beam 4, plane 3 (normal 2 along `tangent_basis`, then the offset as GTSAM stores it, ``-d``), and
+the residual last: predicted minus seen pixel (paper, eq. 55), whitened.
 """
 
 from __future__ import annotations
@@ -32,10 +33,14 @@ from numba import njit
 
 LOSS_NONE, LOSS_HUBER, LOSS_CAUCHY, LOSS_GEMAN_MCCLURE = 0, 1, 2, 3
 COLUMNS = 23
-# columns padded to an even number, and rows of a panel that stays in the first-level cache
-_PADDED, _PANEL = 24, 128
+# columns padded to an even number; spots of a panel that stays in the first-level cache
+_PADDED, _PANEL = 24, 64
 
+# sums may be reordered (vector units); infinities and NaN keep their meaning
+_FAST = {"reassoc", "nsz", "contract"}
 _jit = njit(cache=True, nogil=True, error_model="numpy")
+_jit_fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+_inline = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 
 
 @_jit
@@ -75,134 +80,6 @@ def _beam_in_hand(R, t, l):  # type: ignore[no-untyped-def]  # noqa: E741
 
 
 @_jit
-def _residual(k, uv, Rh, th, u, q, n, d, Rc, tc, K):  # type: ignore[no-untyped-def]
-    """(ok, du, dv): predicted minus seen pixel (8), (9), (1)-(3); not ok: no spot can be there.
-
-    Not ok means: beam parallel to or away from the plane, spot behind the camera, or beyond the
-    radius where the radial distortion turns back on itself.
-    """
-    b0 = Rh[k, 0, 0] * u[0] + Rh[k, 0, 1] * u[1] + Rh[k, 0, 2] * u[2]
-    b1 = Rh[k, 1, 0] * u[0] + Rh[k, 1, 1] * u[1] + Rh[k, 1, 2] * u[2]
-    b2 = Rh[k, 2, 0] * u[0] + Rh[k, 2, 1] * u[1] + Rh[k, 2, 2] * u[2]
-    x0 = Rh[k, 0, 0] * q[0] + Rh[k, 0, 1] * q[1] + Rh[k, 0, 2] * q[2] + th[k, 0]
-    x1 = Rh[k, 1, 0] * q[0] + Rh[k, 1, 1] * q[1] + Rh[k, 1, 2] * q[2] + th[k, 1]
-    x2 = Rh[k, 2, 0] * q[0] + Rh[k, 2, 1] * q[1] + Rh[k, 2, 2] * q[2] + th[k, 2]
-    s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) / (n[0] * b0 + n[1] * b1 + n[2] * b2)
-    x0 += s * b0 - tc[0]
-    x1 += s * b1 - tc[1]
-    x2 += s * b2 - tc[2]
-    z = Rc[0, 2] * x0 + Rc[1, 2] * x1 + Rc[2, 2] * x2
-    x = (Rc[0, 0] * x0 + Rc[1, 0] * x1 + Rc[2, 0] * x2) / z
-    y = (Rc[0, 1] * x0 + Rc[1, 1] * x1 + Rc[2, 1] * x2) / z
-    k1, k2, p1, p2 = K[5], K[6], K[7], K[8]
-    r2 = x * x + y * y
-    g = 1.0 + r2 * (k1 + k2 * r2)
-    xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    ok = s > 0.0 and z > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
-    return ok, K[0] * xd + K[2] * yd + K[3] - uv[k, 0], K[1] * yd + K[4] - uv[k, 1]
-
-
-@_jit
-def _row(k, uv, W, Rh, th, u, q, Rl, n, B, d, Rc, tc, K, J, r):  # type: ignore[no-untyped-def]
-    """Fill columns r, r+1 of ``J`` (23, ...) with the two whitened rows of spot k, by the chain rule.
-
-    False as in `_residual`.
-    """
-    # beam in base and its hit on the plane (8), (9)
-    b0 = Rh[k, 0, 0] * u[0] + Rh[k, 0, 1] * u[1] + Rh[k, 0, 2] * u[2]
-    b1 = Rh[k, 1, 0] * u[0] + Rh[k, 1, 1] * u[1] + Rh[k, 1, 2] * u[2]
-    b2 = Rh[k, 2, 0] * u[0] + Rh[k, 2, 1] * u[1] + Rh[k, 2, 2] * u[2]
-    x0 = Rh[k, 0, 0] * q[0] + Rh[k, 0, 1] * q[1] + Rh[k, 0, 2] * q[2] + th[k, 0]
-    x1 = Rh[k, 1, 0] * q[0] + Rh[k, 1, 1] * q[1] + Rh[k, 1, 2] * q[2] + th[k, 1]
-    x2 = Rh[k, 2, 0] * q[0] + Rh[k, 2, 1] * q[1] + Rh[k, 2, 2] * q[2] + th[k, 2]
-    inu = 1.0 / (n[0] * b0 + n[1] * b1 + n[2] * b2)
-    s = (d - (n[0] * x0 + n[1] * x1 + n[2] * x2)) * inu
-    x0 += s * b0
-    x1 += s * b1
-    x2 += s * b2
-    # in the camera
-    c0, c1, c2 = x0 - tc[0], x1 - tc[1], x2 - tc[2]
-    px = Rc[0, 0] * c0 + Rc[1, 0] * c1 + Rc[2, 0] * c2
-    py = Rc[0, 1] * c0 + Rc[1, 1] * c1 + Rc[2, 1] * c2
-    pz = Rc[0, 2] * c0 + Rc[1, 2] * c1 + Rc[2, 2] * c2
-    iz = 1.0 / pz
-    x, y = px * iz, py * iz
-    fu, fv, sk, k1, k2, p1, p2 = K[0], K[1], K[2], K[5], K[6], K[7], K[8]
-    r2 = x * x + y * y
-    g = 1.0 + r2 * (k1 + k2 * r2)
-    xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    w00, w01, w11 = W[k, 0], W[k, 1], W[k, 2]
-    du = fu * xd + sk * yd + K[3] - uv[k, 0]
-    dv = fv * yd + K[4] - uv[k, 1]
-    J[22, r] = w00 * du + w01 * dv
-    J[22, r + 1] = w11 * dv
-    # whitened pixel with respect to the distorted coordinates, M = W [[fu, sk], [0, fv]]
-    m00, m01, m11 = w00 * fu, w00 * sk + w01 * fv, w11 * fv
-    # intrinsics
-    J[6, r] = w00 * xd
-    J[6, r + 1] = 0.0
-    J[7, r] = w01 * yd
-    J[7, r + 1] = w11 * yd
-    J[8, r] = w00 * yd
-    J[8, r + 1] = 0.0
-    J[9, r] = w00
-    J[9, r + 1] = 0.0
-    J[10, r] = w01
-    J[10, r + 1] = w11
-    J[11, r] = (m00 * x + m01 * y) * r2
-    J[11, r + 1] = m11 * y * r2
-    J[12, r] = J[11, r] * r2
-    J[12, r + 1] = J[11, r + 1] * r2
-    a, b = 2.0 * x * y, r2 + 2.0 * y * y
-    J[13, r] = m00 * a + m01 * b
-    J[13, r + 1] = m11 * b
-    b = r2 + 2.0 * x * x
-    J[14, r] = m00 * b + m01 * a
-    J[14, r + 1] = m11 * a
-    # point in the camera: N = M d(xd, yd)/d(x, y), then d(x, y)/dp
-    dg = k1 + 2.0 * k2 * r2
-    d00 = g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x
-    d01 = 2.0 * x * y * dg + 2.0 * p1 * x + 2.0 * p2 * y
-    d11 = g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x
-    for i in range(2):
-        if i == 0:
-            n0, n1 = (m00 * d00 + m01 * d01) * iz, (m00 * d01 + m01 * d11) * iz
-        else:
-            n0, n1 = m11 * d01 * iz, m11 * d11 * iz
-        n2 = -(n0 * x + n1 * y)
-        # camera pose: dp = [p]x w - v (right perturbation, as Pose3)
-        J[0, r + i] = n1 * pz - n2 * py
-        J[1, r + i] = n2 * px - n0 * pz
-        J[2, r + i] = n0 * py - n1 * px
-        J[3, r + i] = -n0
-        J[4, r + i] = -n1
-        J[5, r + i] = -n2
-        # point in the base
-        g0 = Rc[0, 0] * n0 + Rc[0, 1] * n1 + Rc[0, 2] * n2
-        g1 = Rc[1, 0] * n0 + Rc[1, 1] * n1 + Rc[1, 2] * n2
-        g2 = Rc[2, 0] * n0 + Rc[2, 1] * n1 + Rc[2, 2] * n2
-        along = (g0 * b0 + g1 * b1 + g2 * b2) * inu
-        # plane: dX = u/nu (-X.dn + dd); GTSAM's offset is -d
-        J[19, r + i] = -along * (x0 * B[0, 0] + x1 * B[1, 0] + x2 * B[2, 0])
-        J[20, r + i] = -along * (x0 * B[0, 1] + x1 * B[1, 1] + x2 * B[2, 1])
-        J[21, r + i] = -along
-        # beam: dX = (I - u n^T/nu) R_base_hand (dq + s du)
-        g0 -= along * n[0]
-        g1 -= along * n[1]
-        g2 -= along * n[2]
-        h0 = g0 * Rh[k, 0, 0] + g1 * Rh[k, 1, 0] + g2 * Rh[k, 2, 0]
-        h1 = g0 * Rh[k, 0, 1] + g1 * Rh[k, 1, 1] + g2 * Rh[k, 2, 1]
-        h2 = g0 * Rh[k, 0, 2] + g1 * Rh[k, 1, 2] + g2 * Rh[k, 2, 2]
-        J[17, r + i] = h0 * Rl[0, 0] + h1 * Rl[1, 0] + h2 * Rl[2, 0]
-        J[18, r + i] = h0 * Rl[0, 1] + h1 * Rl[1, 1] + h2 * Rl[2, 1]
-        J[15, r + i] = s * J[17, r + i]
-        J[16, r + i] = s * J[18, r + i]
-    return s > 0.0 and pz > 0.0 and 1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0
-
-
-@_jit
 def tangent_basis(n):  # type: ignore[no-untyped-def]
     """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
     a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
@@ -226,116 +103,293 @@ def tangent_basis(n):  # type: ignore[no-untyped-def]
     return B
 
 
-@_jit
-def residuals(uv, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
-              plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
-    out = np.empty(uv.shape)
-    for m in range(len(blocks)):
-        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
-        for k in range(blocks[m, 3], blocks[m, 4]):
-            ok, du, dv = _residual(k, uv, R_base_hand, t_base_hand, u, q, n, d, Rc, tc, K)
-            out[k, 0] = du if ok else np.nan
-            out[k, 1] = dv if ok else np.nan
-    return out
+@_inline
+def _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d):  # type: ignore[no-untyped-def]
+    """Beam in base and its hit on the plane (8), (9): direction, spot, 1/(n.u), length."""
+    b0 = hands[0, k] * u0 + hands[1, k] * u1 + hands[2, k] * u2
+    b1 = hands[3, k] * u0 + hands[4, k] * u1 + hands[5, k] * u2
+    b2 = hands[6, k] * u0 + hands[7, k] * u1 + hands[8, k] * u2
+    x0 = hands[0, k] * q0 + hands[1, k] * q1 + hands[2, k] * q2 + hands[9, k]
+    x1 = hands[3, k] * q0 + hands[4, k] * q1 + hands[5, k] * q2 + hands[10, k]
+    x2 = hands[6, k] * q0 + hands[7, k] * q1 + hands[8, k] * q2 + hands[11, k]
+    inu = 1.0 / (n0 * b0 + n1 * b1 + n2 * b2)
+    s = (d - (n0 * x0 + n1 * x1 + n2 * x2)) * inu
+    return b0, b1, b2, x0 + s * b0, x1 + s * b1, x2 + s * b2, inu, s
 
 
-@_jit
-def total_loss(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
-               beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
-    total = 0.0
-    for m in range(len(blocks)):
-        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
-        for k in range(blocks[m, 3], blocks[m, 4]):
-            if whitening[k, 2] == 0.0:
-                continue
-            ok, du, dv = _residual(k, uv, R_base_hand, t_base_hand, u, q, n, d, Rc, tc, K)
-            if not ok:
-                return np.inf
-            e0 = whitening[k, 0] * du + whitening[k, 1] * dv
-            e1 = whitening[k, 2] * dv
-            total += loss_value(kind, c_loss, e0 * e0 + e1 * e1)
-    return total if math.isfinite(total) else np.inf
+@_inline
+def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
+    """Distorted coordinates, squared radius and radial factor."""
+    r2 = x * x + y * y
+    g = 1.0 + r2 * (k1 + k2 * r2)
+    xd = g * x + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+    yd = g * y + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+    return xd, yd, r2, g
 
 
-@_jit
-def rows(uv, whitening, R_base_hand, t_base_hand, blocks, cam_R, cam_t, cam_K,
-         beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]  # fmt: skip
-    """Whitened Jacobian and residual of every spot, (N, 2, 23); NaN where no spot can be."""
-    out = np.full((len(uv), 2, COLUMNS), np.nan)
-    J = np.empty((COLUMNS, 2))
-    for m in range(len(blocks)):
-        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        B, Rl = tangent_basis(plane_n[p]), beam_R[l]
-        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
-        for k in range(blocks[m, 3], blocks[m, 4]):
-            if _row(k, uv, whitening, R_base_hand, t_base_hand, u, q, Rl, n, B, d, Rc, tc, K, J, 0):
-                out[k] = J.T
-    return out
+@_inline
+def _impossible(s, z, r2, k1, k2):  # type: ignore[no-untyped-def]
+    """1.0 where no spot can be, else 0.0.
+
+    Beam parallel to or away from the plane, spot behind the camera, or beyond the radius where the
+    radial distortion turns back on itself.
+    """
+    ok = (s > 0.0) & (z > 0.0) & (1.0 + r2 * (3.0 * k1 + 5.0 * k2 * r2) > 0.0)
+    return 0.0 if ok else 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"reassoc", "nsz", "contract"})
-def _add_products(Q, m, S):  # type: ignore[no-untyped-def]
-    """Add ``Q Q^T`` of the first m columns to ``S`` (24, 24), upper 2x2 blocks."""
+@_jit_fast
+def _panel_residuals(pixels, hands, base, count, u, q, n, d, R, t, K, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (3, count): predicted minus seen pixel, and 1.0 where impossible."""
+    u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
+    r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
+    fu, fv, sk, cu, cv, k1, k2, p1, p2 = K[0], K[1], K[2], K[3], K[4], K[5], K[6], K[7], K[8]
+    for i in range(count):
+        k = base + i
+        _, _, _, x0, x1, x2, _, s = _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d)
+        x0, x1, x2 = x0 - t0, x1 - t1, x2 - t2
+        z = r02 * x0 + r12 * x1 + r22 * x2
+        iz = 1.0 / z
+        x, y = (r00 * x0 + r10 * x1 + r20 * x2) * iz, (r01 * x0 + r11 * x1 + r21 * x2) * iz
+        xd, yd, r2, _ = _distort(x, y, k1, k2, p1, p2)
+        out[0, i] = fu * xd + sk * yd + cu - pixels[0, k]
+        out[1, i] = fv * yd + cv - pixels[1, k]
+        out[2, i] = _impossible(s, z, r2, k1, k2)
+
+
+@_jit_fast
+def _panel_loss(pixels, base, count, r, kind, c_loss):  # type: ignore[no-untyped-def]
+    """(sum of the losses, impossible spots) of a panel's residuals ``r`` (3, count)."""
+    total, bad = 0.0, 0.0
+    for i in range(count):
+        k = base + i
+        e0 = pixels[2, k] * r[0, i] + pixels[3, k] * r[1, i]
+        e1 = pixels[4, k] * r[1, i]
+        m = e0 * e0 + e1 * e1
+        total += m if kind == LOSS_NONE else loss_value(kind, c_loss, m)
+        bad += r[2, i]
+    return total, bad
+
+
+@_inline
+def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):  # type: ignore[no-untyped-def]
+    """Whitened rows of spots base ... base+count-1 as columns of ``Q`` (24, 2 _PANEL).
+
+    Column i holds the u row of spot base+i, column _PANEL+i its v row. Returns the number of
+    impossible spots. Inlined, so that the compiler sees the constant shape of ``Q``.
+    """
+    u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
+    r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
+    fu, fv, sk, cu, cv, k1, k2, p1, p2 = K[0], K[1], K[2], K[3], K[4], K[5], K[6], K[7], K[8]
+    l00, l10, l20, l01, l11, l21 = Rl[0, 0], Rl[1, 0], Rl[2, 0], Rl[0, 1], Rl[1, 1], Rl[2, 1]
+    B00, B10, B20, B01, B11, B21 = B[0, 0], B[1, 0], B[2, 0], B[0, 1], B[1, 1], B[2, 1]
+    bad = 0.0
+    for i in range(count):
+        k = base + i
+        b0, b1, b2, x0, x1, x2, inu, s = _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d)
+        c0, c1, c2 = x0 - t0, x1 - t1, x2 - t2
+        px = r00 * c0 + r10 * c1 + r20 * c2
+        py = r01 * c0 + r11 * c1 + r21 * c2
+        pz = r02 * c0 + r12 * c1 + r22 * c2
+        iz = 1.0 / pz
+        x, y = px * iz, py * iz
+        xd, yd, r2, g = _distort(x, y, k1, k2, p1, p2)
+        bad += _impossible(s, pz, r2, k1, k2)
+        w00, w01, w11 = pixels[2, k], pixels[3, k], pixels[4, k]
+        du = fu * xd + sk * yd + cu - pixels[0, k]
+        dv = fv * yd + cv - pixels[1, k]
+        Q[22, i] = w00 * du + w01 * dv
+        Q[22, _PANEL + i] = w11 * dv
+        # whitened pixel by the distorted coordinates: M = W [[fu, sk], [0, fv]]
+        m00, m01, m11 = w00 * fu, w00 * sk + w01 * fv, w11 * fv
+        # intrinsics; what is left out of the v row is zero for good
+        Q[6, i] = w00 * xd
+        Q[7, i] = w01 * yd
+        Q[7, _PANEL + i] = w11 * yd
+        Q[8, i] = w00 * yd
+        Q[9, i] = w00
+        Q[10, i] = w01
+        Q[10, _PANEL + i] = w11
+        a = (m00 * x + m01 * y) * r2
+        Q[11, i] = a
+        Q[12, i] = a * r2
+        a = m11 * y * r2
+        Q[11, _PANEL + i] = a
+        Q[12, _PANEL + i] = a * r2
+        a, b = 2.0 * x * y, r2 + 2.0 * y * y
+        Q[13, i] = m00 * a + m01 * b
+        Q[13, _PANEL + i] = m11 * b
+        b = r2 + 2.0 * x * x
+        Q[14, i] = m00 * b + m01 * a
+        Q[14, _PANEL + i] = m11 * a
+        # distorted by undistorted coordinates (symmetric)
+        dg = k1 + 2.0 * k2 * r2
+        d00 = g + 2.0 * x * x * dg + 2.0 * p1 * y + 6.0 * p2 * x
+        d01 = 2.0 * x * y * dg + 2.0 * p1 * x + 2.0 * p2 * y
+        d11 = g + 2.0 * y * y * dg + 6.0 * p1 * y + 2.0 * p2 * x
+        for row in range(2):
+            j = row * _PANEL + i
+            # whitened pixel by the point in the camera
+            if row == 0:
+                e0, e1 = (m00 * d00 + m01 * d01) * iz, (m00 * d01 + m01 * d11) * iz
+            else:
+                e0, e1 = m11 * d01 * iz, m11 * d11 * iz
+            e2 = -(e0 * x + e1 * y)
+            # camera pose: dp = [p]x w - v (right perturbation, as Pose3)
+            Q[0, j] = e1 * pz - e2 * py
+            Q[1, j] = e2 * px - e0 * pz
+            Q[2, j] = e0 * py - e1 * px
+            Q[3, j] = -e0
+            Q[4, j] = -e1
+            Q[5, j] = -e2
+            # by the point in the base
+            g0 = r00 * e0 + r01 * e1 + r02 * e2
+            g1 = r10 * e0 + r11 * e1 + r12 * e2
+            g2 = r20 * e0 + r21 * e1 + r22 * e2
+            along = (g0 * b0 + g1 * b1 + g2 * b2) * inu
+            # plane: dX = u/nu (dd - X.dn); GTSAM's offset is -d
+            Q[19, j] = -along * (x0 * B00 + x1 * B10 + x2 * B20)
+            Q[20, j] = -along * (x0 * B01 + x1 * B11 + x2 * B21)
+            Q[21, j] = -along
+            # beam: dX = (I - u n^T/nu) R_base_hand (dq + s du)
+            g0, g1, g2 = g0 - along * n0, g1 - along * n1, g2 - along * n2
+            h0 = g0 * hands[0, k] + g1 * hands[3, k] + g2 * hands[6, k]
+            h1 = g0 * hands[1, k] + g1 * hands[4, k] + g2 * hands[7, k]
+            h2 = g0 * hands[2, k] + g1 * hands[5, k] + g2 * hands[8, k]
+            f1 = h0 * l00 + h1 * l10 + h2 * l20
+            f2 = h0 * l01 + h1 * l11 + h2 * l21
+            Q[15, j] = s * f1
+            Q[16, j] = s * f2
+            Q[17, j] = f1
+            Q[18, j] = f2
+    return bad
+
+
+@_jit_fast
+def _add_products(Q, count, S):  # type: ignore[no-untyped-def]
+    """Add ``Q Q^T`` over the panel's first ``count`` spots to ``S`` (24, 24), upper 2x2 blocks."""
     for i in range(0, _PADDED, 2):
         for j in range(i, _PADDED, 2):
             s00 = s01 = s10 = s11 = 0.0
-            for k in range(m):
-                a, b, c, d = Q[i, k], Q[i + 1, k], Q[j, k], Q[j + 1, k]
-                s00 += a * c
-                s01 += a * d
-                s10 += b * c
-                s11 += b * d
+            for half in range(0, 2 * _PANEL, _PANEL):
+                for k in range(half, half + count):
+                    a, b, c, d = Q[i, k], Q[i + 1, k], Q[j, k], Q[j + 1, k]
+                    s00 += a * c
+                    s01 += a * d
+                    s10 += b * c
+                    s11 += b * d
             S[i, j] += s00
             S[i, j + 1] += s01
             S[i + 1, j] += s10
             S[i + 1, j + 1] += s11
 
 
+@_jit_fast
+def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, kind, c_loss, S):  # type: ignore[no-untyped-def]
+    """Add ``[J r]^T [J r]`` of one block to ``S`` (24, 24); returns the impossible spots."""
+    Q = np.zeros((_PADDED, 2 * _PANEL))
+    bad = 0.0
+    for base in range(first, last, _PANEL):
+        count = min(_PANEL, last - base)
+        bad += _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q)
+        if kind != LOSS_NONE:
+            for i in range(count):
+                e0, e1 = Q[22, i], Q[22, _PANEL + i]
+                w = math.sqrt(loss_weight(kind, c_loss, e0 * e0 + e1 * e1))
+                for j in range(COLUMNS):
+                    Q[j, i] *= w
+                    Q[j, _PANEL + i] *= w
+        _add_products(Q, count, S)
+    return bad
+
+
+@_jit_fast
+def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):  # type: ignore[no-untyped-def]
+    """Fill ``out`` (N, 2, 23) with the rows of one block."""
+    Q = np.zeros((_PADDED, 2 * _PANEL))
+    for base in range(first, last, _PANEL):
+        count = min(_PANEL, last - base)
+        _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q)
+        for i in range(count):
+            for j in range(COLUMNS):
+                out[base + i, 0, j] = Q[j, i]
+                out[base + i, 1, j] = Q[j, _PANEL + i]
+
+
 @_jit
-def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n_all, cam_R, cam_t,
-                cam_K, beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]
+    """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
+    out = np.empty((pixels.shape[1], 2))
+    for m in range(len(blocks)):
+        c, l, p, first, last = blocks[m]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        r = np.empty((3, last - first))
+        _panel_residuals(
+            pixels, hands, first, last - first, u, q, plane_n[p], plane_d[p],
+            cam_R[c], cam_t[c], cam_K[c], r,
+        )  # fmt: skip
+        for i in range(last - first):
+            for j in range(2):
+                out[first + i, j] = r[j, i] if r[2, i] == 0.0 else np.nan
+    return out
+
+
+@_jit
+def total_loss(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d,
+               kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+    """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
+    r = np.empty((3, _PANEL))
+    total, bad = 0.0, 0.0
+    for m in range(len(blocks)):
+        c, l, p, first, last = blocks[m]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        for base in range(first, last, _PANEL):
+            count = min(_PANEL, last - base)
+            _panel_residuals(
+                pixels, hands, base, count, u, q, plane_n[p], plane_d[p],
+                cam_R[c], cam_t[c], cam_K[c], r,
+            )  # fmt: skip
+            panel_total, panel_bad = _panel_loss(pixels, base, count, r, kind, c_loss)
+            total += panel_total
+            bad += panel_bad
+    return total if bad == 0.0 and math.isfinite(total) else np.inf
+
+
+@_jit
+def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]
+    """Whitened Jacobian and residual of every spot, (N, 2, 23), possible or not."""
+    out = np.empty((pixels.shape[1], 2, COLUMNS))
+    for m in range(len(blocks)):
+        c, l, p, first, last = blocks[m]  # noqa: E741
+        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+        _block_rows(
+            pixels, hands, first, last, u, q, beam_R[l], plane_n[p], plane_d[p],
+            tangent_basis(plane_n[p]), cam_R[c], cam_t[c], cam_K[c], out,
+        )  # fmt: skip
+    return out
+
+
+@_jit
+def information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
+                plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
     """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
-    Rows are collected in panels that fit the cache, transposed, and multiplied panel by panel.
     """
-    H = np.zeros((n_all + 1, n_all + 1))
-    Q = np.zeros((_PADDED, _PANEL))
+    H = np.zeros((n + 1, n + 1))
     S = np.empty((_PADDED, _PADDED))
     column = np.empty(COLUMNS, np.int64)
+    bad = 0.0
     for m in range(len(blocks)):
-        c, l, p = blocks[m, 0], blocks[m, 1], blocks[m, 2]  # noqa: E741
+        c, l, p, first, last = blocks[m]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        B, Rl = tangent_basis(plane_n[p]), beam_R[l]
-        Rc, tc, K, n, d = cam_R[c], cam_t[c], cam_K[c], plane_n[p], plane_d[p]
         S[:] = 0.0
-        r = 0
-        for k in range(blocks[m, 3], blocks[m, 4]):
-            if whitening[k, 2] == 0.0:
-                continue
-            if not _row(
-                k, uv, whitening, R_base_hand, t_base_hand, u, q, Rl, n, B, d, Rc, tc, K, Q, r
-            ):
-                H[0, 0] = np.nan
-                return H
-            if kind != LOSS_NONE:
-                e0, e1 = Q[COLUMNS - 1, r], Q[COLUMNS - 1, r + 1]
-                w = math.sqrt(loss_weight(kind, c_loss, e0 * e0 + e1 * e1))
-                for i in range(COLUMNS):
-                    Q[i, r] *= w
-                    Q[i, r + 1] *= w
-            r += 2
-            if r == _PANEL:
-                _add_products(Q, r, S)
-                r = 0
-        _add_products(Q, r, S)
+        bad += _block_information(
+            pixels, hands, first, last, u, q, beam_R[l], plane_n[p], plane_d[p],
+            tangent_basis(plane_n[p]), cam_R[c], cam_t[c], cam_K[c], kind, c_loss, S,
+        )  # fmt: skip
         for i in range(6):
             column[i] = offsets[m, 0] + i
         for i in range(9):
@@ -344,14 +398,13 @@ def information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n_all,
             column[15 + i] = offsets[m, 2] + i
         for i in range(3):
             column[19 + i] = offsets[m, 3] + i
-        column[COLUMNS - 1] = n_all
+        column[COLUMNS - 1] = n
         for i in range(COLUMNS):
             for j in range(i, COLUMNS):
-                a, b = column[i], column[j]
-                if a <= b:
-                    H[a, b] += S[i, j]
-                else:
-                    H[b, a] += S[i, j]
+                a, b = min(column[i], column[j]), max(column[i], column[j])
+                H[a, b] += S[i, j]
+    if bad != 0.0:
+        H[0, 0] = np.nan
     return H
 
 
@@ -408,16 +461,16 @@ def cholesky(H):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def square_root_information(uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n,
-                            cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d,
+def square_root_information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K,
+                            beam_R, beam_t, beam_l, plane_n, plane_d,
                             kind, c_loss, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-def]  # fmt: skip
     """`information`, `constrain` and `cholesky` in one go: ``R`` (n+1, n+1), last column residual.
 
     [0, 0] is NaN where a spot cannot be.
     """
     H = information(
-        uv, whitening, R_base_hand, t_base_hand, blocks, offsets, n, cam_R, cam_t, cam_K,
-        beam_R, beam_t, beam_l, plane_n, plane_d, kind, c_loss,
+        pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
+        plane_n, plane_d, kind, c_loss,
     )  # fmt: skip
     if not math.isfinite(H[0, 0]):
         return H

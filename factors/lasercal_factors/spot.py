@@ -3,7 +3,7 @@
 Both say the same: predicted minus seen pixel (paper, eq. 55) of the chain beam -> plane -> camera.
 `LaserSpotFactor` is the textbook custom factor for a graph of your own. `LaserSpotBatchFactor` holds
 any number of spots; it hands GTSAM the square root of their information instead of their rows, so
-that the cost of a linearisation inside GTSAM does not depend on the number of spots.
+that GTSAM's part of a linearisation does not depend on the number of spots.
 
 Variables
 ---------
@@ -31,6 +31,10 @@ from lasercal_factors.wrap import custom_factor
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 LossName = Literal["none", "huber", "cauchy", "geman-mcclure"]
+_IMPOSSIBLE = (
+    "linearised where a beam misses its plane, a spot lies behind its camera, or the distortion "
+    "folds; check the start value"
+)
 LOSSES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman-mcclure": 3}
 
 
@@ -131,15 +135,18 @@ class CellKeys:
 class SpotBatch:
     """Spots sorted into blocks of equal camera, laser and plane; build it with `from_arrays`.
 
-    ``order`` says which input spot each row is: ``uv == uv_input[order]``.
+    Attributes
+    ----------
+    pixels, hands, blocks : see `kernels`; spots along the last axis
+    order : (N,) input index of each spot held
+    size : number of spots given (some may have been left out by `weighted`)
     """
 
-    uv: Array
-    whitening: Array
-    R_base_hand: Array
-    t_base_hand: Array
+    pixels: Array
+    hands: Array
     blocks: Index
     order: Index
+    size: int
 
     @classmethod
     def from_arrays(
@@ -174,64 +181,84 @@ class SpotBatch:
                 "(N, 4, 4) and N with N > 0"
             )
         order = np.lexsort((who[:, 2], who[:, 1], who[:, 0]))
-        who = who[order]
-        first = np.flatnonzero(np.r_[True, np.any(who[1:] != who[:-1], axis=1)])
-        blocks = np.column_stack([who[first], first, np.r_[first[1:], count]])
-        T = T[order]
+        whitening = whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64))
+        pixels = np.concatenate([uv, whitening], axis=1)[order].T
+        hands = np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)[order].T
         return cls(
-            np.ascontiguousarray(uv[order]),
-            whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64)[order]),
-            np.ascontiguousarray(T[:, :3, :3]),
-            np.ascontiguousarray(T[:, :3, 3]),
-            np.ascontiguousarray(blocks),
+            np.ascontiguousarray(pixels),
+            np.ascontiguousarray(hands),
+            _blocks(who[order]),
             order,
+            count,
         )
 
     def __len__(self) -> int:
-        return len(self.uv)
+        return self.size
 
     def weighted(self, weights: npt.ArrayLike) -> SpotBatch:
-        """Return the same spots with their information multiplied by weights (N,), in input order."""
-        root = np.sqrt(np.asarray(weights, dtype=np.float64))[self.order]
-        return SpotBatch(
-            self.uv, self.whitening * root[:, None], self.R_base_hand, self.t_base_hand,
-            self.blocks, self.order,
-        )  # fmt: skip
+        """Multiply the information of each spot by a weight (N,), input order.
+
+        Spots of weight zero are left out altogether, even if no spot can be where they are.
+        """
+        given = np.asarray(weights, dtype=np.float64)
+        if given.shape != (self.size,) or not np.all(given >= 0):
+            raise FactorError(f"weights: expected ({self.size},) numbers >= 0, got {given.shape}")
+        weight = given[self.order]
+        keep = weight > 0
+        if not keep.any():
+            raise FactorError("weights: every spot has weight zero")
+        who = np.repeat(self.blocks[:, :3], self.blocks[:, 4] - self.blocks[:, 3], axis=0)
+        pixels = self.pixels[:, keep].copy()
+        pixels[2:] *= np.sqrt(weight[keep])
+        hands = np.ascontiguousarray(self.hands[:, keep])
+        return SpotBatch(pixels, hands, _blocks(who[keep]), self.order[keep], self.size)
+
+    def scaled(self, scale: float) -> SpotBatch:
+        """The same spots with every pixel sigma multiplied by ``scale``."""
+        pixels = self.pixels.copy()
+        pixels[2:] /= scale
+        return SpotBatch(pixels, self.hands, self.blocks, self.order, self.size)
 
     @cached_property
     def used(self) -> npt.NDArray[np.bool_]:
-        """(N,) booleans in input order: spots with a weight above zero."""
-        out = np.empty(len(self), dtype=np.bool_)
-        out[self.order] = self.whitening[:, 2] > 0
+        """(N,) booleans in input order: spots that are not left out."""
+        out = np.zeros(self.size, dtype=np.bool_)
+        out[self.order] = True
+        return out
+
+    def residuals(self, state: State) -> Array:
+        """Predicted minus seen pixel in input order, (N, 2); NaN where impossible or left out."""
+        out = np.full((self.size, 2), np.nan)
+        out[self.order] = kernels.residuals(self.pixels, self.hands, self.blocks, *state)
         return out
 
     def whitened_lengths(self, state: State) -> Array:
-        """Length of each whitened residual in sigmas, input order, (N,); NaN where impossible."""
-        r, W = self.residuals(state), np.empty_like(self.whitening)
-        W[self.order] = self.whitening
-        return np.asarray(np.hypot(W[:, 0] * r[:, 0] + W[:, 1] * r[:, 1], W[:, 2] * r[:, 1]))
-
-    def residuals(self, state: State) -> Array:
-        """Predicted minus seen pixel in input order, (N, 2); NaN where no spot can be."""
-        out = np.empty_like(self.uv)
-        out[self.order] = kernels.residuals(
-            self.uv, self.R_base_hand, self.t_base_hand, self.blocks, *state
-        )
+        """Length of each whitened residual (sigmas), input order, (N,); NaN as in `residuals`."""
+        du, dv = kernels.residuals(self.pixels, self.hands, self.blocks, *state).T
+        w00, w01, w11 = self.pixels[2:]
+        out = np.full(self.size, np.nan)
+        out[self.order] = np.hypot(w00 * du + w01 * dv, w11 * dv)
         return out
 
     def rows(self, state: State) -> Array:
         """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
-        out = np.empty((len(self), 2, kernels.COLUMNS))
-        out[self.order] = kernels.rows(*self._arrays, *state)
+        out = np.full((self.size, 2, kernels.COLUMNS), np.nan)
+        out[self.order] = kernels.rows(self.pixels, self.hands, self.blocks, *state)
         return out
 
     def total_loss(self, state: State, loss: Loss) -> float:
         """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
-        return float(kernels.total_loss(*self._arrays, *state, LOSSES[loss.name], loss.threshold))
+        return float(
+            kernels.total_loss(
+                self.pixels, self.hands, self.blocks, *state, LOSSES[loss.name], loss.threshold
+            )
+        )
 
-    @property
-    def _arrays(self) -> tuple[Array, Array, Array, Array, Index]:
-        return self.uv, self.whitening, self.R_base_hand, self.t_base_hand, self.blocks
+
+def _blocks(who: Index) -> Index:
+    """Blocks of equal rows of ``who`` (N, 3), which is sorted."""
+    first = np.flatnonzero(np.append(True, np.any(who[1:] != who[:-1], axis=1)))
+    return np.column_stack([who[first], first, np.append(first[1:], len(who))])
 
 
 def LaserSpotFactor(
@@ -268,7 +295,7 @@ def LaserSpotFactor(
     """
     keys = CellKeys(((camera_key, intrinsics_key),), (laser_key,), (plane_key,), (frame,))
     batch = SpotBatch.from_arrays([uv], [cov_uv], [T_base_hand], [0], [0], [0])
-    w00, w01, w11 = batch.whitening[0]
+    w00, w01, w11 = batch.pixels[2:, 0]
 
     def error(values: Any) -> Array:
         du, dv = batch.residuals(keys.read(values))[0]
@@ -277,7 +304,10 @@ def LaserSpotFactor(
         return np.array([w00 * du + w01 * dv, w11 * dv])
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
-        row = batch.rows(keys.read(values))[0]
+        state = keys.read(values)
+        if math.isnan(batch.residuals(state)[0, 0]):
+            raise FactorError("LaserSpotFactor: " + _IMPOSSIBLE)
+        row = batch.rows(state)[0]
         return row[:, 22], [row[:, c] for c in keys.columns]
 
     noise = gtsam.noiseModel.Unit.Create(2)
@@ -349,7 +379,7 @@ class Compressor:
         tie_from = np.array([camera[i, 1] for i, _ in tied], dtype=np.int64)
         mask[tie_from] = True
         ratio = np.array([a for _, a in tied], dtype=np.float64)
-        self._data = (*batch._arrays, offsets, keys.n)
+        self._data = (batch.pixels, batch.hands, batch.blocks, offsets, keys.n)
         self._tail = (
             LOSSES[loss.name], loss.threshold, mask, tie_from, tie_from + 1, ratio,
         )  # fmt: skip
@@ -364,10 +394,7 @@ class Compressor:
         """
         R = kernels.square_root_information(*self._data, *state, *self._tail)
         if not math.isfinite(R[0, 0]):
-            raise FactorError(
-                "linearised where a beam misses its plane, a spot lies behind its camera, or the "
-                "distortion folds; check the start value"
-            )
+            raise FactorError("LaserSpotBatchFactor: " + _IMPOSSIBLE)
         return np.asarray(R)
 
 
