@@ -30,8 +30,8 @@ class CeresRun:
     cell: Cell
 
 
-def build(directory: Path) -> Path:
-    """Compile the comparator (needs cmake, a C++ compiler and libceres-dev); return the binary."""
+def build(directory: Path) -> tuple[Path, Path]:
+    """Compile the comparators (needs cmake, a C++ compiler and libceres-dev): tuned and plain."""
     for command in (
         ["cmake", "-S", str(SOURCE), "-B", str(directory), "-DCMAKE_BUILD_TYPE=Release"],
         ["cmake", "--build", str(directory)],
@@ -39,7 +39,7 @@ def build(directory: Path) -> Path:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             raise SystemExit(f"{' '.join(command)} failed:\n{done.stdout}{done.stderr}")
-    return directory / "solve"
+    return directory / "solve", directory / "solve_plain"
 
 
 def beam_frame(beam: Beam) -> Array:

@@ -35,7 +35,7 @@ from lasercal_gtsam.uncertainty import Uncertainty, estimate_uncertainty, table_
 
 # number of spots: (hand rotations per plane, poses per rotation) on three planes
 SIZES = {90: (3, 10), 900: (10, 30), 9_000: (30, 100), 90_000: (100, 300)}
-SOLVERS = ("DENSE_NORMAL_CHOLESKY", "DENSE_QR", "DENSE_SCHUR", "SPARSE_NORMAL_CHOLESKY")
+STAGES = ("core", "checked", "whole")
 OPTIONS = lc.CalibrationOptions(sigma_px=1.0, robust="none")
 ALLOWANCE = 0.4  # seconds of solving in a round for either side
 
@@ -65,26 +65,30 @@ def start_near(truth: lc.Cell, seed: int) -> lc.Cell:
 class Case:
     """One capture and start, written for Ceres and ready for us."""
 
-    def __init__(self, binary: Path, folder: Path, spots: int, seed: int, tolerance: float) -> None:
+    def __init__(
+        self,
+        programs: tuple[Path, Path],
+        folder: Path,
+        spots: int,
+        seed: int,
+        tolerance: float,
+        solver: str,
+    ) -> None:
         groups, shots = SIZES[spots]
         made = simulate("paper", seed, Noise(pixel_px=1.0), groups=groups, shots=shots)
         self.observations, self.start = made.observations, start_near(made.truth, seed)
-        self.tolerance, self.binary = tolerance, binary
+        self.tolerance, self.solver = tolerance, solver
+        self.tuned, self.plain = programs
         self.holds = resolve_holds(self.observations, OPTIONS, self.start)
         self.batch = make_batch(self.observations, OPTIONS.sigma_px)
         self.file = folder / f"{spots}-{seed}.bin"
         ceres_problem.write(self.file, self.observations, self.start)
-        trials = max(3, 9_000 // spots)
-        self.solver = min(SOLVERS, key=lambda name: self._best_time(trials, name))
 
-    def _best_time(self, trials: int, solver: str) -> float:
-        return min(self.ceres(trials, solver).solve_min for _ in range(2))
-
-    def ceres(self, repeats: int, solver: str | None = None) -> ceres_problem.CeresRun:
+    def ceres(self, program: Path, repeats: int) -> ceres_problem.CeresRun:
         """Solve with Ceres, in its own process."""
         return ceres_problem.run(
-            self.binary, self.file, self.observations, self.start,
-            solver=solver or self.solver, repeats=repeats, tolerance=self.tolerance,
+            program, self.file, self.observations, self.start,
+            solver=self.solver, repeats=repeats, tolerance=self.tolerance,
         )  # fmt: skip
 
     def core(self) -> tuple[float, Array]:
@@ -112,27 +116,25 @@ class Case:
     def row(self, rounds: int) -> dict[str, str | float]:
         """Times in alternation, and the agreement of the answers."""
         tasks = [self.core, self.checked, self.whole]
-        repeats = [_repeats(self.ceres(2).solve_median)]
-        repeats += [_repeats(median_time(task, 2, warm_up=True)) for task in tasks]
-        times = np.empty((rounds, 4))
+        repeats = _repeats(self.ceres(self.tuned, 2).solve_median)
+        task_repeats = [_repeats(median_time(task, 2, warm_up=True)) for task in tasks]
+        times = np.empty((rounds, 5))
         for r in range(rounds):
-            times[r, 0] = self.ceres(repeats[0]).solve_median
-            for i, task in enumerate(tasks, start=1):
-                times[r, i] = median_time(task, repeats[i])
-        milliseconds = 1e3 * np.median(times, axis=0)
-        ratios = np.median(times[:, :1] / times[:, 1:], axis=0)
-        theirs = self.ceres(1)
+            times[r, 0] = self.ceres(self.tuned, repeats).solve_median
+            times[r, 1] = self.ceres(self.plain, repeats).solve_median
+            times[r, 2:] = [median_time(t, n) for t, n in zip(tasks, task_repeats, strict=True)]
+        tuned, plain = (np.median(times[:, [i]] / times[:, 2:], axis=0) for i in (0, 1))
+        theirs = self.ceres(self.tuned, 1)
         solution, uncertainty = self.checked()
-        names = ("core", "checked", "whole")
+        milliseconds = zip(("Ceres", "plain", *STAGES), 1e3 * np.median(times, axis=0), strict=True)
         return {
             "spots": len(self.observations),
-            "Ceres ms": milliseconds[0],
-            **{f"{name} ms": ms for name, ms in zip(names, milliseconds[1:], strict=True)},
-            **{f"/ {name}": ratio for name, ratio in zip(names, ratios, strict=True)},
+            **{f"{name} ms": value for name, value in milliseconds},
+            **{f"Ceres/{name}": value for name, value in zip(STAGES, tuned, strict=True)},
+            **{f"plain/{name}": value for name, value in zip(STAGES, plain, strict=True)},
             "iterations": f"{theirs.iterations}, {solution.iterations}",
             "cost": abs(theirs.final_cost / self.core()[0] - 1),
             "sigmas": _sigmas_apart(theirs.cell, solution, uncertainty),
-            "Ceres by": self.solver,
         }
 
 
@@ -164,14 +166,15 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="captures of 90 spots; one of others")
     parser.add_argument("--rounds", type=int, default=7)
     parser.add_argument("--tolerance", type=float, default=1e-10, help="of Ceres and of core")
+    parser.add_argument("--solver", default="DENSE_NORMAL_CHOLESKY", help="Ceres's linear solver")
     parser.add_argument("--build", type=Path, default=ceres_problem.SOURCE / "build")
     args = parser.parse_args()
-    binary = ceres_problem.build(args.build)
+    programs = ceres_problem.build(args.build)
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for spots in args.sizes:
             for seed in range(args.seeds if spots == 90 else 1):
-                case = Case(binary, Path(folder), spots, seed, args.tolerance)
+                case = Case(programs, Path(folder), spots, seed, args.tolerance, args.solver)
                 row = case.row(args.rounds)
                 if not rows:
                     print("| " + " | ".join(row) + " |\n|" + " --- |" * len(row))
@@ -179,12 +182,12 @@ def main() -> None:
                 print("| " + " | ".join(map(_cell_text, row.values())) + " |", flush=True)
     for spots in args.sizes:
         same = [row for row in rows if row["spots"] == spots]
-        medians = (
-            f"{name[2:]} {statistics.median(float(row[name]) for row in same):.2f}"
-            for name in rows[0]
-            if name.startswith("/ ")
-        )
-        print(f"{spots} spots, Ceres's time over ours (median): {', '.join(medians)}")
+        ratios = [f"{name} {_median(same, name):.2f}" for name in rows[0] if "/" in name]
+        print(f"{spots} spots, medians: {', '.join(ratios)}")
+
+
+def _median(rows: list[dict[str, str | float]], name: str) -> float:
+    return statistics.median(float(row[name]) for row in rows)
 
 
 def _cell_text(value: str | float) -> str:

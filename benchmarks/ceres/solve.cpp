@@ -1,6 +1,6 @@
 // Laser-spot calibration with Ceres and automatic differentiation: the comparator of the speed runs.
 //
-//   solve PROBLEM [--solver NAME] [--tolerance T] [--iterations I] [--repeats N]
+//   solve[_plain] PROBLEM [--solver NAME] [--tolerance T] [--iterations I] [--repeats N]
 //
 // PROBLEM is a stream of native float64 (written by ceres_problem.py):
 //   N, P, R_base_camera (9, row-major), t_base_camera (3), intrinsics (9: fu fv skew u0 v0 k1 k2 p1 p2),
@@ -20,6 +20,7 @@
 #include <memory>
 #include <stdexcept>
 #include <string>
+#include <tuple>
 #include <vector>
 
 namespace {
@@ -128,8 +129,7 @@ Data read(const std::string& path) {
   return data;
 }
 
-// Predicted minus seen pixel of one spot. Eigen fills wide registers only where their length divides
-// that of the Jet: a constant block of two makes 22 derivatives 24 and the solve twice as fast.
+// Predicted minus seen pixel of one spot.
 class SpotError {
  public:
   SpotError(const Data& data, const Spot& spot)
@@ -141,9 +141,11 @@ class SpotError {
     for (int i = 0; i < 3; ++i) t_[i] += spot.t_base_hand[i];
   }
 
-  template <typename T>
+  // The arguments end with the residual; before it may come a block of padding.
+  template <typename T, typename... Tail>
   bool operator()(const T* camera, const T* intrinsics, const T* beam, const T* plane,
-                  const T* /* padding */, T* residual) const {
+                  Tail... tail) const {
+    T* const residual = std::get<sizeof...(Tail) - 1>(std::make_tuple(tail...));
     T direction[3], point[3], normal[3], spot[3], p[3];
     for (int i = 0; i < 3; ++i) {
       direction[i] = R_[3 * i] * beam[0] + R_[3 * i + 1] * beam[1] + R_[3 * i + 2];
@@ -180,6 +182,17 @@ class SpotError {
   Vector3 t_;
   double u_, v_;
 };
+
+// Eigen fills wide registers only where their length divides that of the Jet: a constant block of
+// two makes 22 derivatives 24 and the solve about twice as fast. Both forms in one program would cost
+// the compiler's willingness to inline, hence two programs.
+#ifdef PLAIN_JETS
+constexpr bool padded = false;
+using Cost = ceres::AutoDiffCostFunction<SpotError, 2, 6, 9, 4, 3>;
+#else
+constexpr bool padded = true;
+using Cost = ceres::AutoDiffCostFunction<SpotError, 2, 6, 9, 4, 3, 2>;
+#endif
 
 struct Arguments {
   std::string path;
@@ -227,7 +240,6 @@ struct Run {
 Run run(const Data& data, const ceres::Solver::Options& base) {
   using Clock = std::chrono::steady_clock;
   using Seconds = std::chrono::duration<double>;
-  using Cost = ceres::AutoDiffCostFunction<SpotError, 2, 6, 9, 4, 3, 2>;
   Run result;
   result.state = data.start;
   State& state = result.state;
@@ -235,21 +247,25 @@ Run run(const Data& data, const ceres::Solver::Options& base) {
   {
     ceres::Problem problem;
     double padding[2] = {};
-    problem.AddParameterBlock(padding, 2);
-    problem.SetParameterBlockConstant(padding);
-    for (const Spot& spot : data.spots)
-      problem.AddResidualBlock(new Cost(new SpotError(data, spot)), nullptr, state.camera.data(),
-                               state.intrinsics.data(), state.beam.data(),
-                               state.planes[spot.plane].data(), padding);
+    if (padded) {
+      problem.AddParameterBlock(padding, 2);
+      problem.SetParameterBlockConstant(padding);
+    }
+    for (const Spot& spot : data.spots) {
+      std::vector<double*> blocks = {state.camera.data(), state.intrinsics.data(),
+                                     state.beam.data(), state.planes[spot.plane].data()};
+      if (padded) blocks.push_back(padding);
+      problem.AddResidualBlock(new Cost(new SpotError(data, spot)), nullptr, blocks);
+    }
     ceres::Solver::Options options = base;
     if (ceres::IsSchurType(options.linear_solver_type)) {
       // no two planes share a spot, so they can be eliminated first
       options.linear_solver_ordering = std::make_shared<ceres::ParameterBlockOrdering>();
       for (auto& plane : state.planes)
         options.linear_solver_ordering->AddElementToGroup(plane.data(), 0);
-      for (double* block :
-           {state.camera.data(), state.intrinsics.data(), state.beam.data(), padding})
+      for (double* block : {state.camera.data(), state.intrinsics.data(), state.beam.data()})
         options.linear_solver_ordering->AddElementToGroup(block, 1);
+      if (padded) options.linear_solver_ordering->AddElementToGroup(padding, 1);
     }
     const auto built = Clock::now();
     ceres::Solve(options, &problem, &result.summary);
