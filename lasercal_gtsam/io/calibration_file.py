@@ -7,10 +7,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields
 from datetime import UTC, datetime
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import lasercal_gtsam
 from lasercal_gtsam.calibration import Calibration, Inputs, SpotResults
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.files import read_text, write_text
@@ -59,7 +59,7 @@ def to_dict(
         "initial": cell_to_dict(calibration.initial),
         "inputs": inputs,
         "provenance": {
-            "version": lasercal_gtsam.__version__,
+            "version": _program_version(),
             "created": created.isoformat(timespec="seconds"),
             "sha256": _digest(inputs),
             "files": dict(sources or {}),
@@ -151,6 +151,13 @@ def _inputs(inputs: Inputs) -> dict[str, Any]:
         "observations": observations_to_dict(inputs.observations),
         "options": plain(inputs.options),
     }
+
+
+def _program_version() -> str:
+    try:
+        return metadata.version("lasercal-gtsam")
+    except metadata.PackageNotFoundError:
+        return "unknown"
 
 
 def _digest(inputs: Mapping[str, Any]) -> str:

@@ -22,6 +22,7 @@ from lasercal_gtsam.units import MM_PER_M, RAD_PER_DEG
 if TYPE_CHECKING:
     from lasercal_gtsam.io.capture_head import CaptureHead
     from lasercal_gtsam.io.capture_rows import Rows
+    from lasercal_gtsam.io.yaml_text import Lines
 
 CAPTURE_FILE = "capture.yaml"
 
@@ -237,14 +238,14 @@ def load_capture(path: str | Path) -> Capture:
 
     path = _capture_file(Path(path))
     folder = path.parent
-    head = read_head(path)
+    head, lines = read_head(path)
     rows = read_rows(head, folder)
     if not rows.has_spots and head.images is None:
         raise DataError(
             f"{path.name}: there are no spots: give columns u, v in {head.poses.file}, "
             "spots: {file: spots.csv}, or images: images/{id}.png"
         )
-    on, off, image_warnings = _pictures(head, rows, folder, path.name)
+    on, off, image_warnings = _pictures(head, rows, folder, path.name, lines)
     noise, noise_warnings = _noise(head, path.name)
     files = [head.poses.file, *([head.spots.file] if head.spots else [])]
     return Capture(
@@ -288,15 +289,17 @@ def _capture_file(path: Path) -> Path:
 
 
 def _pictures(
-    head: CaptureHead, rows: Rows, folder: Path, name: str
+    head: CaptureHead, rows: Rows, folder: Path, name: str, lines: Lines
 ) -> tuple[OptionalPaths, OptionalPaths, list[str]]:
     none = (None,) * len(rows.ids)
     if head.images is None:
         return none, none, []
-    patterns = {key: getattr(head.images, key) for key in ("on", "off", "background")}
+    keys = ("on", "off", "background")
+    patterns = {key: getattr(head.images, key) for key in keys}
+    places = {key: f"{name}:{lines.of(('images', key))}: images.{key}" for key in keys}
     columns = {"id": rows.ids, "plane": rows.planes, "camera": rows.cameras, "laser": rows.lasers}
     needed = [not verdict for verdict in rows.verdict]
-    return find_pictures(patterns, folder, columns, needed, name)
+    return find_pictures(patterns, folder, columns, needed, places)
 
 
 def _noise(head: CaptureHead, name: str) -> tuple[CaptureNoise, list[str]]:

@@ -14,7 +14,7 @@ from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.conventions import ROTATION_CHOICES, rotation_format
 from lasercal_gtsam.io.schema import Location, Strict, dotted, validation_problems
 from lasercal_gtsam.io.wording import at_most, did_you_mean
-from lasercal_gtsam.io.yaml_text import read_yaml
+from lasercal_gtsam.io.yaml_text import Lines, read_yaml
 
 KNOWN_NAMES = ("principal_point", "aspect", *INTRINSIC_NAMES)
 
@@ -110,8 +110,8 @@ class CaptureHead(Strict):
     known: dict[str, Any] = Field({}, description="a mapping from names to values")
 
 
-def read_head(path: Path) -> CaptureHead:
-    """Read and check ``capture.yaml``.
+def read_head(path: Path) -> tuple[CaptureHead, Lines]:
+    """Read and check ``capture.yaml``; also returns where its keys stand.
 
     Raises
     ------
@@ -136,7 +136,7 @@ def read_head(path: Path) -> CaptureHead:
         raise DataError(
             *at_most([f"{path.name}:{line}: {key}: {text}" for line, key, text in numbered])
         )
-    return head
+    return head, lines
 
 
 def _without_short_forms(data: dict[Any, Any]) -> tuple[dict[Any, Any], dict[Location, Location]]:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lasercal_gtsam.errors import DataError
-
-_NEW_FILE_MODE = 0o666
 
 
 def read_text(path: str | Path) -> str:
@@ -80,13 +78,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
     try:
         if target.is_dir():
             raise IsADirectoryError
-        handle, name = tempfile.mkstemp(
-            prefix=f".{target.name}.", suffix=target.suffix, dir=target.parent
-        )
-        os.close(handle)
-        temporary = Path(name)
+        temporary = _new_file_beside(target)
         yield temporary
-        temporary.chmod(_mode(target))
+        if target.exists():
+            temporary.chmod(target.stat().st_mode & 0o7777)
         _flush(temporary)
         temporary.replace(target)
         temporary = None
@@ -99,12 +94,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
                 temporary.unlink()
 
 
-def _mode(target: Path) -> int:
-    if target.exists():
-        return target.stat().st_mode & 0o7777
-    mask = os.umask(0)
-    os.umask(mask)
-    return _NEW_FILE_MODE & ~mask
+def _new_file_beside(target: Path) -> Path:
+    """An empty file with the mode that any new file gets (`tempfile` makes private ones)."""
+    path = target.with_name(f".{target.stem}.{secrets.token_hex(8)}{target.suffix}")
+    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    return path
 
 
 def _flush(path: Path) -> None:

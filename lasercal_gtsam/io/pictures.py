@@ -39,15 +39,10 @@ def read_picture(path: Path, size: tuple[int, int], where: str) -> Picture:
     DataError
         The picture is missing, unreadable or of another size.
     """
-    import cv2
-    import numpy as np
-
     if not path.is_file():
         raise DataError(f"{where}: the picture {path} is missing")
     content = read_bytes(path)
-    picture = None
-    if content and not _cut_off(content):
-        picture = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    picture = _decode(content) if content and not _cut_off(content) else None
     if picture is None:
         fault = "empty" if not content else "cut off" if _cut_off(content) else "damaged or unknown"
         raise DataError(
@@ -63,6 +58,20 @@ def read_picture(path: Path, size: tuple[int, int], where: str) -> Picture:
     return picture
 
 
+def _decode(content: bytes) -> Picture | None:
+    """The picture, or None; OpenCV's own complaints on the terminal are held back."""
+    import cv2
+    import numpy as np
+
+    log = cv2.utils.logging
+    level = log.getLogLevel()
+    log.setLogLevel(log.LOG_LEVEL_SILENT)
+    try:
+        return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    finally:
+        log.setLogLevel(level)
+
+
 def _cut_off(content: bytes) -> bool:
     """Whether a PNG or JPEG lacks its end; the decoder would fill a cut JPEG with gray."""
     tail = content[-64:].rstrip(b"\0")
@@ -76,7 +85,7 @@ def find_pictures(
     folder: Path,
     columns: Mapping[str, Sequence[str]],
     needed: Sequence[bool],
-    name: str,
+    places: Mapping[str, str],
 ) -> tuple[OptionalPaths, OptionalPaths, list[str]]:
     """Pictures of each row with the laser on, and off.
 
@@ -87,7 +96,7 @@ def find_pictures(
     folder : the capture's folder
     columns : placeholder name to the N words it stands for
     needed : whether a row's spot will be looked for in its picture; only then must it exist
-    name : name of ``capture.yaml``, for messages
+    places : where each pattern stands in ``capture.yaml``, for messages
 
     Returns
     -------
@@ -112,7 +121,7 @@ def find_pictures(
             else:
                 found[key] = expand_pattern(pattern, folder, rows)
         except DataError as error:
-            problems += [f"{name}: images.{key}: {text}" for text in error.problems]
+            problems += [f"{places[key]}: {text}" for text in error.problems]
     if problems:
         raise DataError(*problems)
     on, off, warnings = found["on"], found["off"], []
@@ -120,8 +129,8 @@ def find_pictures(
         off, replaced = _or_background(off, found["background"], needed)
         if replaced and patterns["off"] is not None:
             warnings.append(
-                f"{name}: {replaced} rows have no laser-off picture of their own; the background "
-                "is used for them"
+                f"{places['off']}: {replaced} rows have no laser-off picture of their own; the "
+                "background is used for them"
             )
     ids = columns["id"]
     problems = _missing(ids, needed, on, "picture") + _shared(ids, needed, on)

@@ -46,7 +46,8 @@ class RowSpot:
     """What became of one row.
 
     ``verdict`` is ``used`` if it gave a spot; else the detector's verdict, or ``missing`` for a
-    row with neither a pixel nor a picture. ``source`` is the file that the spot comes from.
+    row with neither a pixel nor a picture. ``source`` is the path of the picture that was looked
+    at, ``table`` where a table said what to do, or "".
     """
 
     id: str

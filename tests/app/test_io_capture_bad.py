@@ -441,7 +441,7 @@ def test_patterns_that_do_not_fit(tmp_path: Path, pattern: str, expected: str) -
         (tmp_path / name).parent.mkdir(exist_ok=True)
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((480, 640), np.uint8))
     (problem,) = problems_of(tmp_path, HEAD + f"images: {pattern}\n", NO_PIXELS)
-    assert problem.startswith(f"capture.yaml: {expected}")
+    assert problem.startswith(f"capture.yaml:8: {expected}")
 
 
 def test_one_picture_for_two_rows(tmp_path: Path) -> None:
