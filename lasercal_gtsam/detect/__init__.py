@@ -15,14 +15,23 @@ _EXPORTS = {
     "RunnerUp": "detection",
     "contact_sheet": "sheet",
     "detect_spot": "pipeline",
+    "median_frame": "reference",
 }
 
-__all__ = ["Detection", "DetectionOptions", "RunnerUp", "contact_sheet", "detect_spot"]
+__all__ = [
+    "Detection",
+    "DetectionOptions",
+    "RunnerUp",
+    "contact_sheet",
+    "detect_spot",
+    "median_frame",
+]
 
 if TYPE_CHECKING:
     from lasercal_gtsam.detect.detection import Detection, RunnerUp
     from lasercal_gtsam.detect.options import DetectionOptions
     from lasercal_gtsam.detect.pipeline import detect_spot
+    from lasercal_gtsam.detect.reference import median_frame
     from lasercal_gtsam.detect.sheet import contact_sheet
 
 

@@ -75,6 +75,8 @@ def measure_spot(
     options : for the albedo and the floor
     """
     whole = find_region(blurred, candidate)
+    if whole.area > options.max_area_px:
+        return _too_large(frames, blurred, candidate, whole)
     n_saturated = int(np.count_nonzero(frames.saturated[_slices(whole)]))
     reach = int(3 * np.sqrt(np.linalg.eigvalsh(whole.shape)[1])) + _MARGIN
     # dividing a clipped plateau would only print the texture on it
@@ -102,6 +104,22 @@ def measure_spot(
         fill=_at(smooth, centre.uv) / again.peak,
         beside=beside,
         beside_uv=beside_uv + corner,
+    )
+
+
+def _too_large(frames: Frames, blurred: Image, candidate: Candidate, whole: Region) -> Measurement:
+    """Only where it is, as certain as its own size: a fit would take long, and not be used."""
+    return Measurement(
+        centre=Centre(whole.centroid, whole.shape, whole.shape, "centroid"),
+        peak=candidate.peak,
+        n_saturated=int(np.count_nonzero(frames.saturated[_slices(whole)])),
+        saturated_share=0.0,
+        box=whole.box,
+        area=whole.area,
+        bright_area=whole.area,
+        fill=_at(blurred, whole.centroid) / candidate.peak,
+        beside=0.0,
+        beside_uv=whole.centroid,
     )
 
 

@@ -25,7 +25,8 @@ def detect_spot(on: Any, off: Any = None, options: DetectionOptions | None = Non
         Picture with the laser on; uint8, uint16 or float; colour in OpenCV's order (BGR).
     off : like ``on``, or None
         Picture of the same scene without the laser. Without it every bright blob looks like a
-        spot: the verdict is stricter, and still less safe (`Detection.single_frame`).
+        spot: the verdict is stricter, and still less safe (`Detection.single_frame`);
+        `median_frame` makes a stand-in out of several laser-on pictures.
     options : DetectionOptions, optional
 
     Returns
