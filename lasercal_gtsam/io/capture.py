@@ -112,14 +112,12 @@ class Capture(FrozenData):
         if todo and detector is None:
             detector = self._default_detector()
         for done, k in enumerate(todo, start=1):
-            try:
-                on, off = self._read_pictures(k)
-                if detector is not None and not problems:
-                    found[k] = detector(on, off)
-            except DataError as error:
-                problems += error.problems
-            except DetectionError as error:
-                problems.append(f"id {self.ids[k]}: {self.images_on[k]}: {error}")
+            pictures = self._read_pictures(k, problems)
+            if detector is not None and not problems:
+                try:
+                    found[k] = detector(*pictures)
+                except (DataError, DetectionError) as error:
+                    problems.append(f"id {self.ids[k]}: {self.images_on[k]}: {error}")
             if progress is not None:
                 progress(done, len(todo))
         if problems:
@@ -185,19 +183,16 @@ class Capture(FrozenData):
         options = DetectionOptions(saturation_level=self.saturation)
         return lambda on, off: detect_spot(on, off, options)
 
-    def _read_pictures(self, k: int) -> tuple[Picture, Picture | None]:
-        on, off = self.images_on[k], self.images_off[k]
+    def _read_pictures(self, k: int, problems: list[str]) -> list[Any]:
+        """Pictures of a row, on and off; what is wrong with them is added to ``problems``."""
         size, where = self.image_size[str(self.cameras[k])], f"id {self.ids[k]}"
         pictures: list[Picture | None] = []
-        problems: list[str] = []
-        for path in (on, off):
+        for path in (self.images_on[k], self.images_off[k]):
             try:
                 pictures.append(None if path is None else read_picture(path, size, where))
             except DataError as error:
                 problems += error.problems
-        if problems or pictures[0] is None:
-            raise DataError(*problems)
-        return pictures[0], pictures[1]
+        return pictures
 
     def _account(self, found: Mapping[int, FoundSpot]) -> SpotAccount:
         uv, cov = self.uv.copy(), self.cov_uv.copy()
@@ -206,8 +201,8 @@ class Capture(FrozenData):
             spot = found.get(k)
             if spot is not None:
                 uv[k], cov[k] = spot.uv, spot.cov_uv
-                verdict[k], reason[k] = spot.verdict, spot.reason
-                source[k] = str(image)
+                verdict[k] = "used" if spot.usable else spot.verdict
+                reason[k], source[k] = spot.reason, str(image)
             elif not verdict[k]:
                 verdict[k], reason[k] = "missing", "the row has neither a pixel nor a picture"
                 source[k] = ""

@@ -26,8 +26,8 @@ DEFAULT_LASER = "laser"
 USED = "used"
 # A pixel may lie this far outside the outermost pixel centres: spots at the border, no slips.
 OUTSIDE_TOLERANCE_PX = 1.0
-# Rounded rotations below this are what full precision leaves over.
-ROUNDING_WORTH_A_WARNING = 1e-6
+# Rotations with six decimals and more are not worth a word.
+ROUNDING_WORTH_A_WARNING = 2e-6
 # Hand positions beyond these are rather a wrong unit than a robot.
 LARGEST_PLAUSIBLE_M, SMALLEST_PLAUSIBLE_M = 50.0, 0.01
 LARGEST_PLAUSIBLE_RAD = 4 * np.pi

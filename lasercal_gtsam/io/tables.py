@@ -22,7 +22,7 @@ from lasercal_gtsam.io.wording import at_most, nearest, some
 class Table:
     """A CSV file as text columns, with the problems found in it so far.
 
-    Readers take columns out, which adds to the problems, and call `raise_problems` at the end.
+    Taking columns out adds to the problems; whoever reads asks for `problems` at the end.
 
     Attributes
     ----------
@@ -57,11 +57,6 @@ class Table:
         """Every problem so far with file and line, in the order of the lines."""
         ordered = sorted(self._problems, key=lambda problem: problem[0])
         return at_most([f"{self.name}{f':{line}' if line else ''}: {t}" for line, t in ordered])
-
-    def raise_problems(self) -> None:
-        """Raise one `DataError` with all problems, if there are any."""
-        if self._problems:
-            raise DataError(*self.problems())
 
     def require(self, names: Sequence[str], why: str) -> bool:
         """Check that columns are there; missing ones are a problem. True if none is missing.

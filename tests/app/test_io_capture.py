@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
+import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -182,6 +184,23 @@ def test_rows_without_a_pixel_are_accounted_for(tmp_path: Path) -> None:
     assert account.skipped == {"2": "missing: the row has neither a pixel nor a picture"}
     assert account.counts == {"used": 2, "missing": 1}
     assert [row.verdict for row in account] == ["used", "missing", "used"]
+
+
+def test_the_account_of_another_capture_is_refused(tmp_path: Path) -> None:
+    capture = load_capture(folder_with(tmp_path))
+    account = capture.detections()
+    other = load_capture(folder_with(tmp_path, poses=POSES.replace("\n3,", "\n4,")))
+    with pytest.raises(DataError, match="that of another capture"):
+        other.observations(account=account)
+
+
+def test_nothing_heavy_is_imported_before_it_is_needed() -> None:
+    code = (
+        "import sys, lasercal_gtsam.io.capture, lasercal_gtsam.io.calibration_file;"
+        "print(*{'gtsam', 'scipy', 'numba', 'cv2', 'pydantic', 'ruamel.yaml'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
 
 
 def test_provenance_is_the_hash_of_the_files(tmp_path: Path) -> None:
@@ -389,14 +408,15 @@ def test_no_row_gives_a_spot(tmp_path: Path) -> None:
     assert caught.value.problems[1] == "id 1: none: it is dark"
 
 
-def test_what_the_detector_refuses_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize("error", [DataError, DetectionError])
+def test_what_the_detector_refuses_is_named(tmp_path: Path, error: type[Exception]) -> None:
     folder_with(tmp_path, HEAD + "images: '{id}.png'\n", poses=NO_PIXELS)
     for name in "123":
         picture(tmp_path / f"{name}.png", int(name))
 
     def refuse(on: np.ndarray, off: np.ndarray | None) -> FakeSpot:
         if on[0, 0] == 2:
-            raise DetectionError("what is this")
+            raise error("what is this")
         return fake_detector(on, off)
 
     with pytest.raises(DataError, match=r"id 2: .*2\.png: what is this"):
