@@ -15,7 +15,7 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.conventions import quat_from_matrix
 from lasercal_gtsam.observations import Observations
 
-_LINE_LENGTH = 100
+_LINE_LENGTH = 160
 
 
 def plain(value: Any) -> Any:
@@ -127,12 +127,12 @@ def _is_short(value: Any) -> bool:
     while todo:
         item = todo.pop()
         seen += 1
-        if seen > _LINE_LENGTH // 2:
+        if seen > _LINE_LENGTH // 3:
             return False
         if isinstance(item, dict):
             todo += item.values()
         elif isinstance(item, list):
-            if len(item) > _LINE_LENGTH // 2:
+            if len(item) > _LINE_LENGTH // 3:
                 return False
             todo += item
     return True
