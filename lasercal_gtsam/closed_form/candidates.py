@@ -103,12 +103,19 @@ def closed_form_candidates(
     if not pairs:
         raise DegenerateError("\n".join(reasons) or "there are no spots")
     pairs.sort(key=lambda pair: len(pair.spots))
-    candidates = []
+    candidates: list[Candidate] = []
+    refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
         chosen = [pair.found[min(k, len(pair.found) - 1)] for pair in pairs]
-        cell = complete_cell(_merged(pairs, chosen), observations, known, reasons)
+        try:
+            cell = complete_cell(_merged(pairs, chosen), observations, known, reasons)
+        except DegenerateError as error:
+            refusal = refusal or error
+            continue
         rms, negative = cell_reprojection(cell, observations)
         candidates.append(Candidate(cell, rms, chosen[-1].method, negative))
+    if not candidates and refusal:
+        raise refusal
     return tuple(sorted(candidates, key=lambda candidate: candidate.rank))
 
 

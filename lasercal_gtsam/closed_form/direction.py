@@ -2,10 +2,10 @@
 
 While the hand translates by ``w``, the spot moves on the plane by ``P w`` with the oblique
 projector ``P = I - u n'/(n.u)``; a motion along the beam does not move it. So pixels are a
-projective function of the translation (16), (17) whose linear part has the beam as its kernel (22),
-the same in the hand frame for all groups (23). One kernel is poor; two steps make it ten times
-better: pool all groups, then minimise the error of homographies over the two degrees of freedom of
-the direction.
+projective function of the translation (16), (17) whose linear part has the beam as its kernel
+(20)-(22), the same in the hand frame for all groups (23). One kernel is poor; two steps make it ten
+times better: pool all groups, then minimise the error of homographies over the two degrees of
+freedom of the direction.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def translation_map(groups: Groups) -> Array:
 
 
 def group_kernels(groups: Groups) -> Array:
-    """Beam direction from each group alone, as the kernel of (17)'s linear part (22): (G, 3).
+    """Beam direction from each group alone, kernel of the linear part of (17), (20)-(22): (G, 3).
 
     Unit vectors in the hand frame, ``R_g' u_g`` of (23); their sign is free.
     """

@@ -6,17 +6,21 @@ The order of the stages is here and nowhere else: directions, beams, spots, came
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from lasercal_gtsam.closed_form.beam_fit import refine_beam
 from lasercal_gtsam.closed_form.camera import (
     KnownIntrinsics,
+    Resection,
     cameras_from_points,
+    impose,
 )
 from lasercal_gtsam.closed_form.direction import robust_directions
+from lasercal_gtsam.closed_form.general import solve_general
 from lasercal_gtsam.closed_form.groups import Groups
+from lasercal_gtsam.closed_form.one_plane import solve_one_plane
 from lasercal_gtsam.closed_form.requirements import check_beam, check_spots
 from lasercal_gtsam.closed_form.search import search_beams
 from lasercal_gtsam.closed_form.solution import (
@@ -24,6 +28,7 @@ from lasercal_gtsam.closed_form.solution import (
     Solution,
     beam_towards_spots,
     reprojection,
+    spots_on_beams,
 )
 from lasercal_gtsam.closed_form.spots import IMAGE_DIAGONAL, Spots
 from lasercal_gtsam.closed_form.triangulation import (
@@ -55,20 +60,6 @@ class PairCandidate:
         return self.rms_px + NEGATIVE_DEPTH_PENALTY_PX * self.negative
 
 
-def beams_from_groups(
-    groups: Groups, planes: list[PlaneSpots]
-) -> Iterator[tuple[str, Array, Array]]:
-    """Beams (name, u, q) whose direction comes from the groups; the point from `beam_fit`."""
-    directions, _ = robust_directions(groups)
-    for u in directions:
-        usable = solvable_planes(planes, u)
-        if not usable:
-            continue
-        u_fixed, q, _ = refine_beam(usable, u, np.zeros(3), point_only=True)
-        yield "direction from groups", u_fixed, q
-        yield "beam from groups and spots", *refine_beam(usable, u, q)[:2]
-
-
 def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[PairCandidate]:
     """Closed-form solutions of one pair, best first.
 
@@ -82,32 +73,75 @@ def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[Pai
     """
     check_spots(spots)
     planes = scaled_planes(spots)
-    found = _candidates(spots, planes, beams_from_groups(groups, planes), known)
+    directions, _ = robust_directions(groups)
+    reasons: list[str] = []
+    found = _ranked(solutions_from_groups(spots, groups, directions, known, reasons), spots)
+    found += _ranked(
+        solutions_from_beams(spots, planes, beams_from_directions(directions, planes), known), spots
+    )
     largest_rms_px = PLAUSIBLE_RMS * float(np.hypot(*spots.image_size))
-    if not any(_plausible(candidate, largest_rms_px) for candidate in found):
+    if not any(c.negative <= PLAUSIBLE_NEGATIVE and c.rms_px <= largest_rms_px for c in found):
         beams = (("search", u, q) for u, q in search_beams(planes))
-        found += _candidates(spots, planes, beams, known)
+        found += _ranked(solutions_from_beams(spots, planes, beams, known), spots)
     if not found:
-        raise DegenerateError(
-            "no solution was found: each plane needs 6 spots or more that are not in one line, "
-            "made with hand orientations that turn the beam"
+        reasons.append(
+            "each plane needs 6 spots or more that are not in one line, made with hand orientations "
+            "that turn the beam"
         )
+        raise DegenerateError("no solution was found: " + "; ".join(dict.fromkeys(reasons)))
     found.sort(key=lambda candidate: candidate.rank)
     check_beam(spots.R, spots.t, found[0].solution.u)
     return found
 
 
-def _plausible(candidate: PairCandidate, largest_rms_px: float) -> bool:
-    return candidate.negative <= PLAUSIBLE_NEGATIVE and candidate.rms_px <= largest_rms_px
+def solutions_from_groups(
+    spots: Spots, groups: Groups, directions: Array, known: KnownIntrinsics, reasons: list[str]
+) -> Iterator[tuple[str, Solution]]:
+    """The forms on homographies of groups: `general` for several planes, `one_plane` for one.
+
+    Why a form failed is added to ``reasons``.
+    """
+    for u in directions:
+        try:
+            if spots.plane_count > 1:
+                solution = solve_general(groups, spots, u)
+                yield "general form", _imposed(solution, spots, known)
+            else:
+                for name, solution in solve_one_plane(groups, spots, u, known):
+                    yield f"one plane, {name}", solution
+        except DegenerateError as error:
+            reasons.append(str(error))
 
 
-def _candidates(
+def _imposed(solution: Solution, spots: Spots, known: KnownIntrinsics) -> Solution:
+    """The solution with the known intrinsics put in and the camera's pose fitted again."""
+    K = np.asarray(spots.scaling @ solution.K)
+    points, _ = spots_on_beams(solution, spots)
+    good = np.isfinite(points).all(axis=1)
+    camera = impose(Resection(K, solution.R, solution.T), known, points[good], spots.xy[good])
+    K = np.asarray(np.linalg.solve(spots.scaling, camera.K))
+    return replace(solution, K=K, R=camera.R, T=camera.T)
+
+
+def beams_from_directions(
+    directions: Array, planes: list[PlaneSpots]
+) -> Iterator[tuple[str, Array, Array]]:
+    """Beams (name, u, q) with a given direction, and refined with their direction."""
+    for u in directions:
+        usable = solvable_planes(planes, u)
+        if usable:
+            _, q, _ = refine_beam(usable, u, np.zeros(3), point_only=True)
+            yield "direction from groups", u, q
+            yield "beam from groups and spots", *refine_beam(usable, u, q)[:2]
+
+
+def solutions_from_beams(
     spots: Spots,
     planes: list[PlaneSpots],
     beams: Iterable[tuple[str, Array, Array]],
     known: KnownIntrinsics,
-) -> list[PairCandidate]:
-    found = []
+) -> Iterator[tuple[str, Solution]]:
+    """The triangulation form: spots from each beam, then every camera that they give."""
     for beam_name, u, q in beams:
         triangulated = triangulate(planes, spots, u, q)
         seen = np.flatnonzero(np.isfinite(triangulated.normals).all(axis=1))
@@ -119,17 +153,18 @@ def _candidates(
             known,
             IMAGE_DIAGONAL,
         ):
-            solution = Solution(
-                np.asarray(np.linalg.solve(spots.scaling, camera.K)),
-                camera.R,
-                camera.T,
-                u,
-                q,
-                triangulated.normals,
-                triangulated.centres,
+            K = np.asarray(np.linalg.solve(spots.scaling, camera.K))
+            yield (
+                f"{beam_name}, {camera_name}",
+                Solution(K, camera.R, camera.T, u, q, triangulated.normals, triangulated.centres),
             )
-            solution = beam_towards_spots(solution, spots)
-            rms, negative = reprojection(solution, spots)
-            if np.isfinite(rms):
-                found.append(PairCandidate(solution, rms, negative, f"{beam_name}, {camera_name}"))
+
+
+def _ranked(solutions: Iterable[tuple[str, Solution]], spots: Spots) -> list[PairCandidate]:
+    found = []
+    for name, solution in solutions:
+        solution = beam_towards_spots(solution, spots)
+        rms, negative = reprojection(solution, spots)
+        if np.isfinite(rms):
+            found.append(PairCandidate(solution, rms, negative, name))
     return found

@@ -4,7 +4,7 @@ Shifting the whole scene by ``w`` and scaling it by ``1 + s`` changes no pixel i
 follow, that is if ``s t_k + w = R_k d`` (apart from motions along the beam) for some shift ``d`` of
 the beam in the hand. So the poses must leave ``[t_k, I, -R_k]`` of full rank: hand orientations
 about more than one axis, and motions that are not rotations about one point. This holds for any
-number of planes and is the rank of the translation step, systems (27), (30)-(32) and (54).
+number of planes and is the rank of the translation steps (30)-(32) and (53).
 """
 
 from __future__ import annotations

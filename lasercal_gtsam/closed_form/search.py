@@ -13,7 +13,7 @@ import numpy as np
 
 from lasercal_gtsam.closed_form.beam_fit import refine_beam
 from lasercal_gtsam.closed_form.direction import best_distinct_index, hemisphere
-from lasercal_gtsam.closed_form.triangulation import PlaneSpots
+from lasercal_gtsam.closed_form.triangulation import DISTINCT_BEAMS_RAD, PlaneSpots, solvable_planes
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.units import RAD_PER_DEG
 
@@ -21,6 +21,7 @@ SPOTS_FOR_SEARCH = 10
 """Spots a plane needs before its lifted system says anything of the direction."""
 HEMISPHERE_POINTS = 500
 _DISTINCT_RAD = 12.0 * RAD_PER_DEG
+_FIRST_ROUNDS = 8
 _MERGED_RAD = 0.5 * RAD_PER_DEG
 
 
@@ -78,9 +79,25 @@ def trial_directions(planes: list[PlaneSpots], keep: int = 6) -> Array:
 
 def search_beams(planes: list[PlaneSpots], keep: int = 4) -> list[tuple[Array, Array]]:
     """Beams (u, q) that fit the spots of all planes best, from no start, best first."""
-    found = [refine_beam(planes, u, np.zeros(3), rounds=8) for u in trial_directions(planes)]
+    planes = [plane for plane in planes if _orientation_spread(plane) > DISTINCT_BEAMS_RAD]
+    if not planes:
+        return []
+    found = []
+    for u in trial_directions(planes):
+        usable = solvable_planes(planes, u)
+        if usable:
+            found.append(refine_beam(usable, u, np.zeros(3), rounds=_FIRST_ROUNDS))
     found.sort(key=lambda beam: beam[2])
     u, cost = np.array([beam[0] for beam in found]), np.array([beam[2] for beam in found])
     best = best_distinct_index(u, cost, keep, _MERGED_RAD)
-    polished = sorted((refine_beam(planes, *found[i][:2]) for i in best), key=lambda b: b[2])
-    return [(u, q) for u, q, _ in polished]
+    polished = [
+        refine_beam(usable, *found[i][:2])
+        for i in best
+        if (usable := solvable_planes(planes, found[i][0]))
+    ]
+    return [(u, q) for u, q, _ in sorted(polished, key=lambda beam: beam[2])]
+
+
+def _orientation_spread(plane: PlaneSpots) -> float:
+    """Rms angle (radians) of a plane's hand orientations about their mean, roughly."""
+    return float(np.linalg.norm(plane.R - plane.R.mean(axis=0)) / np.sqrt(2.0 * len(plane)))

@@ -77,7 +77,7 @@ def beam_towards_spots(solution: Solution, spots: Spots) -> Solution:
     """
     u = solution.u
     q = solution.q - (solution.q @ u) * u
-    along = _along_beam(u, q, solution, spots)
+    _, along = spots_on_beams(replace(solution, u=u, q=q), spots)
     along = along[np.isfinite(along)]
     if not len(along):
         return replace(solution, q=q)
@@ -89,12 +89,16 @@ def beam_towards_spots(solution: Solution, spots: Spots) -> Solution:
     return replace(solution, u=u, q=q)
 
 
-def _along_beam(u: Array, q: Array, solution: Solution, spots: Spots) -> Array:
-    """Signed length from ``q`` to the spot along the beam, corrected (8): (N,)."""
+def spots_on_beams(solution: Solution, spots: Spots) -> tuple[Array, Array]:
+    """Where the beams meet the planes (N, 3) in the base, and how far along, corrected (8), (9).
+
+    NaN on planes that are not solved; a length is negative where the plane lies behind ``q``.
+    """
     n, c = solution.normals[spots.plane], solution.points[spots.plane]
+    u, q = spots.R @ solution.u, spots.R @ solution.q + spots.t
     with np.errstate(divide="ignore", invalid="ignore"):
-        height = (n * (c - spots.t - spots.R @ q)).sum(-1)
-        return np.asarray(height / (n * (spots.R @ u)).sum(-1))
+        length = (n * (c - q)).sum(-1) / (n * u).sum(-1)
+        return q + length[:, None] * u, np.asarray(length)
 
 
 def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
@@ -103,8 +107,7 @@ def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
     Spots on unsolved planes do not count. A spot behind the camera is projected all the same, so
     that the first number stays comparable.
     """
-    d = _along_beam(solution.u, solution.q, solution, spots)
-    X = spots.R @ solution.q + spots.t + d[:, None] * (spots.R @ solution.u)
+    X, length = spots_on_beams(solution, spots)
     p = (X - solution.T) @ solution.R
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         image = p @ (spots.scaling @ solution.K).T
@@ -113,7 +116,7 @@ def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
     counted = np.isfinite(solution.normals[spots.plane]).all(axis=1)
     if not counted.any():
         return np.inf, 1.0
-    negative = ~((p[:, 2] > 0) & (d > 0))
+    negative = ~((p[:, 2] > 0) & (length > 0))
     mean = squared[counted].mean()
     return float(np.sqrt(mean)) if np.isfinite(mean) else np.inf, float(negative[counted].mean())
 
