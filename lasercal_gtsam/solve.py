@@ -19,7 +19,7 @@ CONVERGED_SIGMAS = 1e-3
 _POLISHED_SIGMAS = 1e-7
 _MAX_POLISH = 6
 # residual scale below which data are exact to rounding and sigmas have no meaning (px)
-_ROUNDING_PX = 1e-9
+_ROUNDING_PX = 1e-7
 _MAX_SCALE_ROUNDS = 12
 _MIN_SCALE = 1e-7
 
