@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -167,18 +167,12 @@ class Calibration(FrozenData):
     def table(self) -> str:
         """Text of the paper's Table 2: Initial | Refined | sigma | Unit, RMS row last."""
         lines = [("", "Initial", "Refined", "sigma", "Unit")]
-        lines += [_table_row(p) for p in self.parameters]
+        lines += [table_row(p) for p in self.parameters]
         lines.append(("RMS", "", f"{self.fit.rms_px:.4g}", "", "px"))
-        widths = [max(len(line[i]) for line in lines) for i in range(5)]
-        rows = [
-            f"{a:<{widths[0]}} | {b:>{widths[1]}} | {c:>{widths[2]}} | {d:>{widths[3]}} | {e}".rstrip()
-            for a, b, c, d, e in lines
-        ]
-        rule = "-+-".join("-" * w for w in widths)
-        return "\n".join([rows[0], rule, *rows[1:-1], rule, rows[-1]])
+        return text_table(lines)
 
     def save(self, path: str | Path) -> None:
-        """Write ``calibration.json`` (atomically: the old file stays until the new one is whole)."""
+        """Write ``calibration.json`` atomically: the old file stays until the new one is whole."""
         from lasercal_gtsam.io.calibration_file import save_calibration
 
         save_calibration(self, path)
@@ -190,19 +184,47 @@ class Calibration(FrozenData):
         return to_dict(self)
 
 
-def _table_row(p: Parameter) -> tuple[str, str, str, str, str]:
-    """Decimals follow the sigma (two significant digits of it), as a metrologist prints them."""
+def table_row(p: Parameter) -> tuple[str, str, str, str, str]:
+    """Cells of a row: decimals follow the sigma (two significant digits), as metrologists print."""
+    decimals = table_decimals(p)
     if not np.isfinite(p.sigma):
-        return p.name, _plain(p.initial, 4), _plain(p.refined, 4), "unknown", p.unit
-    if p.sigma <= 0:
-        return p.name, _plain(p.initial, 4), _plain(p.refined, 4), "held", p.unit
-    decimals = int(np.clip(1 - np.floor(np.log10(p.sigma)), 0, 9))
-    sigma = f"{p.sigma:.{decimals}f}"
-    return p.name, _plain(p.initial, decimals), _plain(p.refined, decimals), sigma, p.unit
+        sigma = "unknown"
+    else:
+        sigma = f"{p.sigma:.{decimals}f}" if p.sigma > 0 else "held"
+    return (
+        p.name,
+        plain_number(p.initial, decimals),
+        plain_number(p.refined, decimals),
+        sigma,
+        p.unit,
+    )
 
 
-def _plain(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}" if np.isfinite(value) else ""
+def table_decimals(p: Parameter) -> int:
+    """How many decimals a row is printed with."""
+    if not (np.isfinite(p.sigma) and p.sigma > 0):
+        return 4
+    return int(np.clip(1 - np.floor(np.log10(p.sigma)), 0, 9))
+
+
+def plain_number(value: float, decimals: int) -> str:
+    """Number with that many decimals, never "-0.00"; empty where it is not finite."""
+    return f"{round(value, decimals) + 0.0:.{decimals}f}" if np.isfinite(value) else ""
+
+
+def text_table(lines: Sequence[tuple[str, ...]]) -> str:
+    """Columns with bars between them: heading first, totals last; first and last column left."""
+    last = len(lines[0]) - 1
+    widths = [max(len(line[i]) for line in lines) for i in range(last + 1)]
+    rows = [
+        " | ".join(
+            f"{cell:<{w}}" if i in (0, last) else f"{cell:>{w}}"
+            for i, (cell, w) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    ]
+    rule = "-+-".join("-" * w for w in widths)
+    return "\n".join([rows[0], rule, *rows[1:-1], rule, rows[-1]])
 
 
 def rms_px(residual_px: Array) -> float:
