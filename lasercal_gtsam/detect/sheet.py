@@ -37,8 +37,9 @@ def contact_sheet(
 ) -> Sheet:
     """Draw a tile for each picture: the spot's surroundings, its centre, its size, the verdict.
 
-    A cross marks the centre and an ellipse the spot at 2 sigma; the small inset is the whole
-    picture with the crop framed and the second candidate, if any, ringed. Pictures are taken one
+    An ellipse marks the spot at 2 sigma and four ticks point at its centre, which stays free to be
+    looked at; brightness is stretched to what the tile shows. The small inset is the whole picture
+    with the crop framed and the second candidate, if any, ringed. Pictures are taken one
     at a time from the iterable, so that hundreds need the memory of one.
 
     Parameters
@@ -86,7 +87,7 @@ def _tile(picture: Any, detection: Detection, name: str, size: int) -> Sheet:
     colour = _COLOURS.get(detection.verdict, _REFUSED)
     view = _view(picture)
     box = _crop_box(detection, view.shape)
-    crop = _cut(view, box)
+    crop = _stretched(_cut(view, box))
     scale = size / box[2]
     image = cv2.resize(crop, (size, size), interpolation=cv2.INTER_NEAREST)
     if np.isfinite(detection.uv).all():
@@ -138,6 +139,13 @@ def _cut(view: Sheet, box: tuple[int, int, int]) -> Sheet:
     return crop
 
 
+def _stretched(crop: Sheet) -> Sheet:
+    """Brightness from the crop's darkest to its brightest: a faint spot shows as well."""
+    low, high = (float(x) for x in np.percentile(crop, (1.0, 100.0)))
+    scale = 255.0 / max(high - low, 1.0)
+    return np.asarray(np.clip((crop - low) * scale, 0, 255), dtype=np.uint8)
+
+
 def _draw_spot(
     image: Any,
     detection: Detection,
@@ -153,9 +161,10 @@ def _draw_spot(
     )
     angle = float(np.degrees(detection.angle_rad))
     cv2.ellipse(image, centre, axes, angle, 0.0, 360.0, colour, 1, cv2.LINE_AA, 4)
-    arm = 16 * 7
-    for du, dv in ((arm, 0), (0, arm)):
-        start, end = (centre[0] - du, centre[1] - dv), (centre[0] + du, centre[1] + dv)
+    near, far = axes[0] + 16 * 3, axes[0] + 16 * 11
+    for du, dv in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+        start = (centre[0] + du * near, centre[1] + dv * near)
+        end = (centre[0] + du * far, centre[1] + dv * far)
         cv2.line(image, start, end, colour, 1, cv2.LINE_AA, 4)
 
 
