@@ -41,8 +41,8 @@ def load_cell(path: str | Path) -> Cell:
     kind = data.get("format", FORMATS[0]) if isinstance(data, dict) else None
     if kind not in FORMATS or data.get("version", 1) != 1:
         raise DataError(
-            f"{path}: expected a mapping with cameras, lasers and planes, and if it states a format, "
-            f"one of {', '.join(FORMATS)}, version 1"
+            f"{path}: expected a mapping with cameras, lasers and planes, and if it states a "
+            f"format, one of {', '.join(FORMATS)}, version 1"
         )
     problems: list[str] = []
     try:
