@@ -1,0 +1,189 @@
+"""`lasercal calibrate`: a capture in, the table on the screen and ``calibration.json`` out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
+from lasercal_gtsam.cli.outputs import check_calibration_target
+from lasercal_gtsam.cli.texts import account_lines, count, looked_at, result_lines
+from lasercal_gtsam.cli.values import Assignment, Distortion, Number
+
+if TYPE_CHECKING:
+    from lasercal_gtsam.calibration import Calibration
+    from lasercal_gtsam.cell import Cell
+    from lasercal_gtsam.io.capture import Capture
+    from lasercal_gtsam.io.spot_account import SpotAccount
+
+CALIBRATION_FILE = "calibration.json"
+
+
+@click.command(
+    short_help="Estimate the cell of a capture and save it with its sigmas.",
+    epilog="Exit status: 0 saved; 1 wrong data, or an answer that cannot be trusted.",
+)
+@click.argument("capture", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help=f"Where the result goes.  [default: {CALIBRATION_FILE} beside the capture]",
+)
+@click.option(
+    "--initial",
+    metavar="CELL.json",
+    type=click.Path(path_type=Path),
+    help="Start from this cell (drawings, or an earlier calibration.json) instead of from the "
+    "data alone.",
+)
+@click.option(
+    "--distortion",
+    type=Distortion(),
+    metavar="all|none|k1,k2",
+    default="all",
+    show_default=True,
+    help="Terms of the lens distortion to estimate, out of k1, k2, p1, p2.",
+)
+@click.option(
+    "--known",
+    type=Assignment(),
+    metavar="NAME=VALUE",
+    multiple=True,
+    help="Hold at this value: principal_point=320,240, skew=0, aspect=1, fu, fv, u0, v0, k1, ... "
+    "Repeatable; wins over capture.yaml.",
+)
+@click.option(
+    "--fixed",
+    metavar="NAME",
+    multiple=True,
+    help="Hold at the start's value: an intrinsic, intrinsics, T_base_camera, camera:NAME, "
+    "laser:NAME or plane:NAME. Repeatable; mostly used with --initial.",
+)
+@click.option(
+    "--robust",
+    type=click.Choice(["auto", "none"]),
+    default="auto",
+    show_default=True,
+    help="Whether outliers are looked for, named and left out.",
+)
+@click.option(
+    "--sigma-px",
+    metavar="X",
+    type=click.FloatRange(min=0, min_open=True),
+    help="Sigma of pixels that have none of their own; wins over capture.yaml.",
+)
+@click.option(
+    "--keep-unconverged",
+    is_flag=True,
+    help="Save also an answer that cannot be trusted (the exit status stays 1).",
+)
+@json_option
+def calibrate(
+    capture: Path,
+    output: Path | None,
+    initial: Path | None,
+    distortion: str | tuple[str, ...],
+    known: tuple[tuple[str, Number], ...],
+    fixed: tuple[str, ...],
+    robust: str,
+    sigma_px: float | None,
+    keep_unconverged: bool,
+    as_json: bool,
+) -> int:
+    """Calibrate the cell of CAPTURE (capture.yaml, or its folder) and save the result.
+
+    Prints the parameters with their sigmas, what was held, what was rejected and why. Spots without
+    pixels are looked for in their pictures.
+    """
+    from lasercal_gtsam.io.capture import load_capture
+
+    loaded = load_capture(capture)
+    warn(loaded.warnings)
+    target = _target(output, loaded.path)
+    start = _start(initial)
+    with progress("Looking at pictures") as show:
+        account = loaded.detections(progress=show)
+    observations = loaded.observations(account=account)
+    given = {} if sigma_px is None else {"sigma_px": sigma_px}
+    options = loaded.options(
+        distortion=distortion, robust=robust, fixed=fixed, known=dict(known), **given
+    )
+
+    from lasercal_gtsam.api import calibrate as solve
+
+    result = solve(observations, initial=start, options=options)
+    saved = target if result.fit.converged or keep_unconverged else None
+    try:
+        if saved is not None:
+            save(result, saved, loaded)
+    finally:  # a full disk must not cost the answer
+        if as_json:
+            print_json(_document(result, loaded, account, saved))
+        else:
+            click.echo("\n".join(_report(result, loaded, account)))
+    if saved is not None and not as_json:
+        click.echo(f"Saved {saved}.")
+    if result.fit.converged:
+        return 0
+    outcome = "saved all the same" if saved else "nothing was saved (see --keep-unconverged)"
+    click.echo(f"Error: {result.fit.status}; {outcome}", err=True)
+    return 1
+
+
+def save(result: Calibration, path: Path, capture: Capture) -> None:
+    """Write ``calibration.json`` with the digests of the files it comes from."""
+    from lasercal_gtsam.io.calibration_file import save_calibration
+
+    save_calibration(result, path, sources=capture.provenance)
+
+
+def _target(output: Path | None, capture: Path) -> Path:
+    target = capture.parent / CALIBRATION_FILE if output is None else output
+    if target.is_dir():
+        target = target / CALIBRATION_FILE
+    check_calibration_target(target)
+    return target
+
+
+def _start(path: Path | None) -> Cell | None:
+    if path is None:
+        return None
+    from lasercal_gtsam.io.cell_file import load_cell
+
+    return load_cell(path)
+
+
+def _report(result: Calibration, capture: Capture, account: SpotAccount) -> list[str]:
+    seen = result.inputs.observations
+    lines = [
+        f"{capture.path}: {count(len(seen), 'spot')} on {count(len(seen.planes), 'plane')} "
+        f"({', '.join(seen.planes)})"
+    ]
+    if pictures := looked_at(account):
+        lines.append(f"{count(pictures, 'picture')} looked at")
+    skipped = account_lines(account, f"see 'lasercal detect {capture.path.parent}'")
+    if skipped:
+        lines += [f"{count(len(account.skipped), 'row')} without a usable spot:", *skipped]
+    return [*lines, "", *result_lines(result)]
+
+
+def _document(
+    result: Calibration, capture: Capture, account: SpotAccount, saved: Path | None
+) -> dict[str, Any]:
+    """Build what ``calibration.json`` holds, and what only the run itself knows."""
+    from lasercal_gtsam.io.calibration_file import to_dict
+
+    return {
+        **to_dict(result, sources=capture.provenance),
+        "run": {
+            "capture": str(capture.path),
+            "saved": None if saved is None else str(saved),
+            "pictures": looked_at(account),
+            "verdicts": account.counts,
+            "skipped": account.skipped,
+            "warnings": capture.warnings,
+        },
+    }

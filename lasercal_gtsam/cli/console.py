@@ -1,0 +1,66 @@
+"""What all commands share: results on stdout, everything else on stderr, progress on terminals."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+
+Progress = Callable[[int, int], None]
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print the result as one JSON document on stdout."
+)
+
+
+def warn(warnings: Iterable[str]) -> None:
+    """Print each warning as a line on stderr."""
+    for text in warnings:
+        click.echo(f"Warning: {text}", err=True)
+
+
+def print_json(document: Mapping[str, Any]) -> None:
+    """Print one JSON document on stdout."""
+    from lasercal_gtsam.io.plain import plain, to_json
+
+    click.echo(to_json(plain(document)))
+
+
+def wrapped(text: str, indent: str = "", hanging: str | None = None) -> str:
+    """Text filled to the terminal's width; as it is where stdout is no terminal (logs, grep)."""
+    if not sys.stdout.isatty():
+        return indent + text
+    return textwrap.fill(
+        text,
+        width=max(40, min(shutil.get_terminal_size().columns, 100)),
+        initial_indent=indent,
+        subsequent_indent=indent if hanging is None else hanging,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def bullets(lines: Sequence[str]) -> list[str]:
+    """Return the lines indented below a heading, each wrapped with a hanging indent."""
+    return [wrapped(line, "  ", "      ") for line in lines]
+
+
+@contextmanager
+def progress(label: str) -> Iterator[Progress]:
+    """Give a function (done, total) that draws a progress bar on stderr if that is a terminal."""
+    if not sys.stderr.isatty():
+        yield lambda done, total: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bar
+
+    columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

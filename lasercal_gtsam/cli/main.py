@@ -1,0 +1,62 @@
+"""Entry point of `lasercal`: the group of commands, and what an exit status means.
+
+0 done; 1 something is wrong with the data or the answer, said in one line each on stderr; 2 wrong
+usage; 130 interrupted. Anything else is a bug and keeps its traceback.
+"""
+
+from __future__ import annotations
+
+import io
+import sys
+from collections.abc import Sequence
+
+import click
+
+from lasercal_gtsam import __version__
+from lasercal_gtsam.cli.calibrate import calibrate
+from lasercal_gtsam.cli.demo import demo
+from lasercal_gtsam.cli.detect import detect
+from lasercal_gtsam.cli.simulate import simulate
+from lasercal_gtsam.errors import LasercalError
+
+FAILED, USAGE, INTERRUPTED = 1, 2, 130
+
+
+@click.group(
+    name="lasercal",
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="'lasercal demo' shows the whole way on simulated pictures; begin with it. "
+    "'lasercal COMMAND -h' explains a command.",
+)
+@click.version_option(__version__, prog_name="lasercal", message="%(prog)s %(version)s")
+def cli() -> None:
+    """Calibrate a robot cell from pictures of a laser spot and hand poses.
+
+    Camera intrinsics, the camera in the robot base, the beam in the hand and every working plane,
+    each number with its sigma.
+    """
+
+
+for _command in (calibrate, detect, simulate, demo):
+    cli.add_command(_command)
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run `lasercal` and return its exit status; a user's error becomes a line on stderr."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # a name that the terminal cannot show must not end a calibration
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        status = cli.main(args=args, prog_name="lasercal", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return error.exit_code
+    except click.Abort:
+        click.echo("Interrupted: nothing was saved half written.", err=True)
+        return INTERRUPTED
+    except LasercalError as error:
+        for line in str(error).splitlines():
+            click.echo(f"Error: {line}", err=True)
+        return FAILED
+    return status if isinstance(status, int) else 0
