@@ -59,7 +59,8 @@ def _ranked(mask: Mask, blurred: Image) -> tuple[Candidate, ...]:
     label, height = labels[v, u], blurred[v, u]
     order = np.lexsort((u, v, -height, label))
     first = order[np.r_[True, np.diff(label[order]) > 0]]
-    found = [Candidate(int(u[i]), int(v[i]), float(height[i])) for i in first]
+    # a bump in a dark hollow has no light of its own
+    found = [Candidate(int(u[i]), int(v[i]), float(height[i])) for i in first if height[i] > 0]
     return tuple(sorted(found, key=lambda c: (-c.peak, c.v, c.u)))
 
 

@@ -66,7 +66,7 @@ class DetectionOptions:
     clutter_shift_px: float = 0.1
     clutter_gain: float = 0.01
     ambiguous_ratio: float = 0.35
-    ambiguous_ratio_single: float = 0.2
+    ambiguous_ratio_single: float = 0.1
     edge_margin_px: float = 1.0
     min_area_px: int = 4
     max_area_px: int = 4000

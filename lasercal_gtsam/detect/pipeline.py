@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -68,10 +69,20 @@ def _rival(spot: Measurement, ranked: tuple[Candidate, ...]) -> RunnerUp | None:
 
 
 def _nothing(frames: Frames, difference: Difference, options: DetectionOptions) -> Detection:
+    reason = (
+        f"nothing rises above {options.threshold_sigmas:g} sigma of the background "
+        f"(noise {difference.noise:.3g}) and the clutter"
+    )
+    if frames.off is not None:
+        turned = find_candidates(
+            replace(difference, light=-difference.light), options.threshold_sigmas
+        )
+        if turned.ranked:
+            at = turned.ranked[0]
+            reason += f"; the off frame is brighter at ({at.u}, {at.v}): are on and off swapped?"
     return Detection(
         verdict="none",
-        reason=f"nothing rises above {options.threshold_sigmas:g} sigma of the background "
-        f"(noise {difference.noise:.3g}) and the clutter",
+        reason=reason,
         uv=np.full(2, np.nan),
         cov_uv=np.full((2, 2), np.nan),
         noise=difference.noise,
