@@ -34,7 +34,7 @@ from numba import njit
 LOSS_NONE, LOSS_HUBER, LOSS_CAUCHY, LOSS_GEMAN_MCCLURE = 0, 1, 2, 3
 COLUMNS = 23
 # columns padded to an even number; spots of a panel that stays in the first-level cache
-_PADDED, _PANEL = 24, 64
+_PADDED, _PANEL = 24, 32
 
 # sums may be reordered (vector units); infinities and NaN keep their meaning
 _FAST = {"reassoc", "nsz", "contract"}
@@ -269,17 +269,23 @@ def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):  # t
 
 @_jit_fast
 def _add_products(Q, count, S):  # type: ignore[no-untyped-def]
-    """Add ``Q Q^T`` over the panel's first ``count`` spots to ``S`` (24, 24), upper 2x2 blocks."""
+    """Add ``Q Q^T`` over the panel's first ``count`` spots to ``S`` (24, 24), upper 2x2 blocks.
+
+    The rest of the panel is cleared: a loop of constant length is what the vector units want.
+    """
+    for i in range(COLUMNS):
+        for k in range(count, _PANEL):
+            Q[i, k] = 0.0
+            Q[i, _PANEL + k] = 0.0
     for i in range(0, _PADDED, 2):
         for j in range(i, _PADDED, 2):
             s00 = s01 = s10 = s11 = 0.0
-            for half in range(0, 2 * _PANEL, _PANEL):
-                for k in range(half, half + count):
-                    a, b, c, d = Q[i, k], Q[i + 1, k], Q[j, k], Q[j + 1, k]
-                    s00 += a * c
-                    s01 += a * d
-                    s10 += b * c
-                    s11 += b * d
+            for k in range(2 * _PANEL):
+                a, b, c, d = Q[i, k], Q[i + 1, k], Q[j, k], Q[j + 1, k]
+                s00 += a * c
+                s01 += a * d
+                s10 += b * c
+                s11 += b * d
             S[i, j] += s00
             S[i, j + 1] += s01
             S[i + 1, j] += s10
