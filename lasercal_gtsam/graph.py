@@ -80,7 +80,8 @@ class CellGraph:
         for key, frame, beam in lasers:
             values.insert(key, frame.coordinates(beam.direction_hand, beam.point_hand))
         for key, plane in zip(self.keys.planes, cell.planes.values(), strict=True):
-            values.insert(key, gtsam.OrientedPlane3(np.append(plane.normal_base, -plane.distance)))
+            a, b, c = plane.normal_base
+            values.insert(key, gtsam.OrientedPlane3(a, b, c, -plane.distance))
         return values
 
     def cell(self, values: gtsam.Values) -> Cell:
@@ -137,7 +138,8 @@ def make_graph(
     aspects = tuple(holds.aspect.get(name) for name in start.cameras)
     keys = keys_for(len(start.cameras), len(frames), len(start.planes), frames, aspects)
     problem = CellGraph(batch, keys, holds, start, loss or Loss())
-    check_prior_names(holds, start, problem.charts)
+    if holds.priors:
+        check_prior_names(holds, start, problem.charts)
     return problem
 
 

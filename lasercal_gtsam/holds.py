@@ -50,6 +50,8 @@ class Holds:
 
     def apply(self, cell: Cell) -> Cell:
         """Put the known values (and tied focal lengths) into a start."""
+        if not self.aspect and not any(self.known.values()):
+            return cell
         cameras: dict[str, Camera] = {}
         for name, camera in cell.cameras.items():
             values = dict(zip(INTRINSIC_NAMES, camera.intrinsics.vector, strict=True))

@@ -7,6 +7,8 @@ common sense does.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lasercal_gtsam.calibration import WeakDirection
@@ -16,7 +18,8 @@ from lasercal_gtsam.units import DEG_PER_RAD, MM_PER_M
 # singular value of the range-scaled information below which a direction is called weak / singular
 WEAK = 1.0
 SINGULAR = 1e-4
-_NAMED_SHARE = 0.3
+# what is named of a direction: shares of its largest part, and how many
+_NAMED_SHARE, _NAMED_COUNT = 0.3, 6
 
 _RANGES = {
     "rot": 0.1, "trans": 0.05, "fu": 50.0, "fv": 50.0, "skew": 10.0, "u0": 50.0, "v0": 50.0,
@@ -30,32 +33,54 @@ def plausible_ranges(labels: tuple[str, ...]) -> Array:
     return np.array([_RANGES[_kind(label)] for label in labels])
 
 
-def weak_directions(
-    R: Array, labels: tuple[str, ...], free: Array, threshold: float = WEAK
-) -> tuple[WeakDirection, ...]:
-    """Directions with a range-scaled singular value below ``threshold``, weakest first.
+@dataclass(frozen=True, eq=False)
+class RangeSvd:
+    """Singular value decomposition of the range-scaled square-root information.
 
-    Parameters
+    Attributes
     ----------
-    R : (m, n) square-root information in sigmas
-    labels : n names of the tangent coordinates
-    free : (n,) booleans: coordinates that are estimated
+    values : (m,) singular values, largest first; m free coordinates
+    directions : (m, m) rows: the directions, in units of the ranges
+    ranges : (m,) plausible ranges (rad, m, px, 1)
+    labels : names of the free coordinates
     """
-    columns = np.flatnonzero(free)
-    ranges = plausible_ranges(labels)[columns]
-    _, values, Vt = np.linalg.svd(R[:, columns] * ranges)
-    values = np.append(values, np.zeros(len(columns) - len(values)))
-    found: list[WeakDirection] = []
-    for i in np.argsort(values, kind="stable"):
-        if values[i] >= threshold:
-            break
-        move = Vt[i]
-        top = np.flatnonzero(np.abs(move) >= _NAMED_SHARE * np.abs(move).max())
-        top = top[np.argsort(-np.abs(move[top]), kind="stable")][:6]
-        sign = np.sign(move[top[0]])
-        words = ", ".join(_amount(labels[columns[j]], sign * move[j] * ranges[j]) for j in top)
-        found.append(WeakDirection(float(values[i]), words))
-    return tuple(found)
+
+    values: Array
+    directions: Array
+    ranges: Array
+    labels: tuple[str, ...]
+
+    @classmethod
+    def of(cls, R: Array, labels: tuple[str, ...], free: Array) -> RangeSvd:
+        """Decompose ``R`` (rows, n), information in sigmas, over the ``free`` (n,) columns."""
+        names = tuple(label for label, is_free in zip(labels, free, strict=True) if is_free)
+        ranges = plausible_ranges(names)
+        _, values, Vt = np.linalg.svd(R[:, free] * ranges, full_matrices=True)
+        values = np.append(values, np.zeros(len(names) - len(values)))
+        return cls(values, Vt, ranges, names)
+
+    def covariance(self) -> Array:
+        """(m, m) inverse of the information; all singular values must be positive."""
+        root = self.directions.T / self.values * self.ranges[:, None]
+        return np.asarray(root @ root.T)
+
+    def weak_directions(
+        self, threshold: float = WEAK, sigma: float = 1.0
+    ) -> tuple[WeakDirection, ...]:
+        """Directions with a singular value below ``threshold``, weakest first.
+
+        ``sigma`` multiplies the pixel sigmas that ``R`` was whitened with.
+        """
+        found: list[WeakDirection] = []
+        for strength, move in zip(self.values[::-1] / sigma, self.directions[::-1], strict=True):
+            if strength >= threshold:
+                break
+            top = np.flatnonzero(np.abs(move) >= _NAMED_SHARE * np.abs(move).max())
+            top = top[np.argsort(-np.abs(move[top]), kind="stable")][:_NAMED_COUNT]
+            sign = np.sign(move[top[0]])
+            words = ", ".join(_amount(self.labels[j], sign * move[j] * self.ranges[j]) for j in top)
+            found.append(WeakDirection(float(strength), words))
+        return tuple(found)
 
 
 def _kind(label: str) -> str:

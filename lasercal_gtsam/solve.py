@@ -11,12 +11,12 @@ from lasercal_gtsam.cell import Cell, Intrinsics
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import CellGraph
-from lasercal_gtsam.observability import SINGULAR, weak_directions
+from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.report_map import tangent_labels
 
 # Newton decrement (distance to the optimum in sigmas) at which a solution counts as reached
 CONVERGED_SIGMAS = 1e-3
-_POLISHED_SIGMAS = 1e-7
+_POLISHED_SIGMAS = 1e-6
 _MAX_POLISH = 6
 # residual scale below which data are exact to rounding and sigmas have no meaning (px)
 _ROUNDING_PX = 1e-7
@@ -127,11 +127,11 @@ def square_root_information(problem: CellGraph, values: gtsam.Values) -> Array:
     return np.asarray(problem.graph.linearize(values).jacobian(natural_order(problem))[0])
 
 
-def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> None:
-    """Raise `DegenerateError` naming the directions that the data do not determine at all."""
+def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> RangeSvd:
+    """Decompose the information; `DegenerateError` names directions that are not determined."""
     R = square_root_information(problem, values)
-    labels = tangent_labels(problem.start)
-    weak = weak_directions(R, labels, free_columns(problem), SINGULAR)
+    svd = RangeSvd.of(R, tangent_labels(problem.start), free_columns(problem))
+    weak = svd.weak_directions(SINGULAR)
     if weak:
         raise DegenerateError(
             f"the spots leave {len(weak)} combination(s) of unknowns undetermined: "
@@ -139,6 +139,7 @@ def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> None:
             + ". Add hand orientations (at least three, not about one axis), longer translations or "
             "a tilted plane, or hold what is known"
         )
+    return svd
 
 
 def _optimise(
@@ -146,6 +147,7 @@ def _optimise(
 ) -> tuple[gtsam.Values, int]:
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(max_iterations)
+    params.setOrdering(natural_order(problem))
     params.setRelativeErrorTol(1e-10)
     params.setAbsoluteErrorTol(1e-18)
     optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, params)
@@ -156,6 +158,7 @@ def _optimise(
 def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, float]:
     """Undamped Newton steps while they lower the error; the last step's length in sigmas."""
     error = problem.graph.error(values)
+    rows = 2.0 * len(problem.batch.order)
     decrement = np.inf
     for _ in range(_MAX_POLISH):
         linear = problem.graph.linearize(values)
@@ -165,7 +168,9 @@ def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, flo
             refuse_if_singular(problem, values)
             return values, np.inf
         decrement = float(np.sqrt(max(0.0, -step.dot(linear.gradientAtZero()))))
-        if decrement < _POLISHED_SIGMAS * max(1.0, np.sqrt(2 * error)):
+        if decrement < max(
+            _POLISHED_SIGMAS * np.sqrt(2 * error / rows), 1e-6 * _ROUNDING_PX / problem.scale
+        ):
             break
         moved = values.retract(step)
         new_error = problem.graph.error(moved)

@@ -7,6 +7,7 @@ becomes a `FactorError` with the factor's name.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -62,10 +63,10 @@ def custom_factor(
             e = error(values)
         else:
             e, jacobians = linearize(values)
-            found = [np.shape(J) for J in jacobians]
+            found = [J.shape for J in jacobians]
             if found != shapes:
                 raise FactorError(f"{name}: Jacobians of shape {found}, expected {shapes}")
-            if not np.isfinite(e).all():
+            if not math.isfinite(e @ e):
                 raise FactorError(f"{name}: residual is not finite where it is linearised")
             for i, J in enumerate(jacobians):
                 H[i] = J
