@@ -35,7 +35,30 @@ _EXPORTS = {
     "spot_triangulated": "projection",
 }
 
-__all__ = sorted([*_EXPORTS, "__version__"])
+__all__ = [
+    "Beam",
+    "Calibration",
+    "CalibrationOptions",
+    "Camera",
+    "Cell",
+    "DataError",
+    "DegenerateError",
+    "DetectionError",
+    "Intrinsics",
+    "LasercalError",
+    "Observations",
+    "Parameter",
+    "Plane",
+    "SolveError",
+    "__version__",
+    "calibrate",
+    "load_calibration",
+    "load_capture",
+    "project",
+    "spot_on_beam",
+    "spot_on_ray",
+    "spot_triangulated",
+]
 
 if TYPE_CHECKING:
     from lasercal_gtsam.api import calibrate

@@ -105,7 +105,7 @@ def assemble(
     """
     uncertainty = estimate_uncertainty(solution)
     problem = solution.problem
-    cell = _in_order(solution.cell, start)
+    cell = _with_unobserved(solution.cell, start)
     residuals = batch.residuals(problem.keys.read(problem.values(solution.cell)))
     used = np.array([reason is None for reason in reasons])
     warnings = fold_warnings(solution.cell)
@@ -127,7 +127,7 @@ def assemble(
             residuals,
             used.astype(np.float64),
             reasons,
-        ),  # fmt: skip
+        ),
         observability=Observability(uncertainty.weak, problem.holds.words, tuple(warnings)),
         inputs=Inputs(observations, options),
     )
@@ -144,7 +144,10 @@ def _fit(
     if solution.troubles:
         status = "not to be trusted: " + "; ".join(solution.troubles)
     else:
-        status = f"converged in {solution.iterations} iterations: {len(residuals)} spots, RMS {rms:.3g} px"
+        status = (
+            f"converged in {solution.iterations} iterations: {len(residuals)} spots, "
+            f"RMS {rms:.3g} px"
+        )
         if n_rejected:
             status += f", {n_rejected} rejected as outliers"
         if uncertainty.dof < 1:
@@ -191,20 +194,20 @@ def _restricted(cell: Cell, like: Cell) -> Cell:
     )
 
 
-def _in_order(estimate: Cell, start: Cell) -> Cell:
+def _with_unobserved(estimate: Cell, start: Cell) -> Cell:
     """The estimate, and the start's parts that nothing was observed of, unchanged."""
     return Cell(
-        estimate.cameras | {k: v for k, v in start.cameras.items() if k not in estimate.cameras},
-        estimate.lasers | {k: v for k, v in start.lasers.items() if k not in estimate.lasers},
-        estimate.planes | {k: v for k, v in start.planes.items() if k not in estimate.planes},
+        {**start.cameras, **estimate.cameras},
+        {**start.lasers, **estimate.lasers},
+        {**start.planes, **estimate.planes},
     )
 
 
 def _check_supported(options: CalibrationOptions) -> None:
     if options.robust not in ("auto", "none"):
         raise DataError(
-            f"options.robust: {options.robust!r} is not available yet; use 'auto' (outliers are found, "
-            "named and left out) or 'none'"
+            f"options.robust: {options.robust!r} is not available yet; use 'auto' (outliers are "
+            "found, named and left out) or 'none'"
         )
     if options.distortion == "auto":
         raise DataError(

@@ -174,7 +174,7 @@ class Cell:
 
 
 def check_pose(T: Array, name: str) -> Array:
-    """Return ``T`` if it is one or a stack of rigid transforms (..., 4, 4), else raise `DataError`."""
+    """Return ``T``, one or a stack of rigid transforms (..., 4, 4); else raise `DataError`."""
     R = T[..., :3, :3]
     error = np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max(axis=(-1, -2))
     bad = (error > ROTATION_TOLERANCE) | (np.linalg.det(R) < 0)

@@ -114,9 +114,13 @@ def make_batch(observations: Observations, sigma_px: float | None) -> SpotBatch:
     if unknown.any():
         cov = np.where(unknown[:, None, None], (sigma_px or 1.0) ** 2 * np.eye(2), cov)
     return SpotBatch.from_arrays(
-        observations.uv, cov, observations.T_base_hand,
-        observations.camera_index, observations.laser_index, observations.plane_index,
-    )  # fmt: skip
+        observations.uv,
+        cov,
+        observations.T_base_hand,
+        observations.camera_index,
+        observations.laser_index,
+        observations.plane_index,
+    )
 
 
 def make_graph(
@@ -173,8 +177,8 @@ def _ordered(cell: Cell, observations: Observations) -> Cell:
         missing = [name for name in need if name not in have]
         if missing:
             raise DataError(
-                f"initial: {kind[:-1]} {missing[0]!r} has spots but is not in the given cell, which "
-                f"has {sorted(have)}"
+                f"initial: {kind[:-1]} {missing[0]!r} has spots but is not in the given cell, "
+                f"which has {sorted(have)}"
             )
         parts.append({name: have[name] for name in need})
     for name, camera in parts[0].items():
@@ -189,58 +193,56 @@ def _ordered(cell: Cell, observations: Observations) -> Cell:
 def _prior_factor(
     keys: CellKeys, holds: Holds, template: Cell, charts: dict[str, BeamChart]
 ) -> gtsam.CustomFactor:
-    """All priors as one factor: (row of the table - mean) / sigma."""
-    names = [name for name, _ in report_map.row_names(template, charts)]
-    units = [unit for _, unit in report_map.row_names(template, charts)]
-    several = len(template.cameras) > 1
-    aspects = {(f"{c}." if several else "") + "aspect": i for i, c in enumerate(template.cameras)}
+    """All priors as one factor: (row of the table - mean) / sigma; ``aspect`` by its logarithm."""
+    rows = report_map.row_names(template, charts)
+    index = {name: i for i, (name, _) in enumerate(rows)}
+    prefix = "{}." if len(template.cameras) > 1 else ""
+    aspects = {f"{prefix.format(c)}aspect": i for i, c in enumerate(template.cameras)}
+    frames = dict(zip(template.lasers, keys.frames, strict=True))
     columns = keys.columns
-    laser_frames = dict(zip(template.lasers, keys.frames, strict=True))
+    focal = [columns[2 * c + 1].start for c in range(len(template.cameras))]
 
-    def residual(cell: Cell, rows: Array) -> Array:
+    def residual(cell: Cell) -> Array:
+        values = report_map.row_values(cell, charts)
+        intrinsics = [camera.intrinsics for camera in cell.cameras.values()]
         e = np.empty(len(holds.priors))
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
             if name in aspects:
-                camera = list(cell.cameras.values())[aspects[name]].intrinsics
-                e[r] = np.log(camera.fu / camera.fv / mean) * mean / sigma
+                ratio = intrinsics[aspects[name]].fu / intrinsics[aspects[name]].fv
+                e[r] = np.log(ratio / mean) * mean / sigma
                 continue
-            i = names.index(name)
-            difference = rows[i] - mean
-            if units[i] == "deg":
+            difference = values[index[name]] - mean
+            if rows[index[name]][1] == "deg":
                 difference = (difference + 180.0) % 360.0 - 180.0
             e[r] = difference / sigma
         return e
 
     def error(values: Any) -> Array:
-        cell = cell_from_state(keys.read(values), template, keys.frames)
-        return residual(cell, report_map.row_values(cell, charts))
+        return residual(cell_from_state(keys.read(values), template, keys.frames))
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         state = keys.read(values)
         cell = cell_from_state(state, template, keys.frames)
-        F = report_map.row_jacobian(cell, charts, laser_frames)
-        for i, c in enumerate(columns[-len(state.plane_d) :]):
-            block = report_map.plane_jacobian(state.plane_n[i], state.plane_d[i])
-            block[:, 2] *= -1.0
-            F[c, c] = block
+        F = report_map.row_jacobian(cell, charts, frames)
+        for i, c in enumerate(columns[len(columns) - len(keys.planes) :]):
+            # at GTSAM's normal, whichever way it points, and its offset -d
+            F[c, c] = report_map.plane_jacobian(state.plane_n[i], state.plane_d[i])
+            F[c, c.stop - 1] *= -1.0
         J = np.zeros((len(holds.priors), keys.n))
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
             if name in aspects:
-                first = columns[2 * aspects[name] + 1].start
-                fu, fv = state.cam_K[aspects[name], :2]
-                J[r, first : first + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
+                camera = aspects[name]
+                fu, fv = state.cam_K[camera, :2]
+                J[r, focal[camera] : focal[camera] + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
             else:
-                J[r] = F[names.index(name)] / sigma
-        for c, aspect in enumerate(keys.aspects):
+                J[r] = F[index[name]] / sigma
+        held = holds.held.copy()
+        for first, aspect in zip(focal, keys.aspects, strict=True):
             if aspect is not None:
-                first = columns[2 * c + 1].start
                 J[:, first + 1] += aspect * J[:, first]
-        J[:, holds.held] = 0.0
-        for c, aspect in enumerate(keys.aspects):
-            if aspect is not None:
-                J[:, columns[2 * c + 1].start] = 0.0
-        e = residual(cell, report_map.row_values(cell, charts))
-        return e, [J[:, c] for c in columns]
+                held[first] = True
+        J[:, held] = 0.0
+        return residual(cell), [J[:, c] for c in columns]
 
     noise = gtsam.noiseModel.Unit.Create(len(holds.priors))
     return custom_factor("priors", noise, keys.keys, keys.dims, error, linearize)

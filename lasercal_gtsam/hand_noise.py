@@ -60,9 +60,13 @@ def adjusted_batch(
     S = cov_uv + np.einsum("nij,j,nkj->nik", B, variances, B)
     shift = np.einsum("nij,nj->ni", B, next_eta)
     batch = SpotBatch.from_arrays(
-        observations.uv + shift, S, T,
-        observations.camera_index, observations.laser_index, observations.plane_index,
-    )  # fmt: skip
+        observations.uv + shift,
+        S,
+        T,
+        observations.camera_index,
+        observations.laser_index,
+        observations.plane_index,
+    )
     return batch, next_eta
 
 

@@ -57,7 +57,7 @@ class Observations(FrozenData):
             values = np.array(getattr(self, name), dtype=np.str_)
             if values.shape != (n,):
                 raise DataError(
-                    f"Observations.{name}: expected {n} names (one a spot), got shape {values.shape}"
+                    f"Observations.{name}: expected {n} names, one a spot; got shape {values.shape}"
                 )
             values.flags.writeable = False
             object.__setattr__(self, name, values)

@@ -58,5 +58,6 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         if self.robust not in get_args(Robust):
             raise DataError(
-                f"options.robust: expected one of {', '.join(get_args(Robust))}, got {self.robust!r}"
+                f"options.robust: got {self.robust!r}, expected one of "
+                + ", ".join(get_args(Robust))
             )

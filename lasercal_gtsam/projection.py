@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 
 T = TypeVar("T")
+Index = npt.NDArray[np.int64]
 Names = str | Sequence[str] | None
 
 
@@ -237,7 +239,7 @@ def _plane_arrays(cell: Cell, plane: Names, count: int) -> tuple[Array, Array]:
 
 def _select(
     parts: Mapping[str, T], names: Names, count: int, kind: str
-) -> list[tuple[T, Array | slice]]:
+) -> list[tuple[T, Index | slice]]:
     """Pairs (part, rows that use it)."""
     if names is None:
         if len(parts) != 1:

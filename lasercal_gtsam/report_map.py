@@ -1,8 +1,8 @@
 """From the solver's state to the rows of the paper's Table 2, with exact derivatives.
 
-The state is what solves well (rotation matrix, line, normal and offset); the rows are what the paper
-prints: Euler angles z-y-x, beam angles and crossing point (5)-(6), plane vectors ``a`` (4). Units of
-the rows: px, mm, deg. The derivatives carry the covariance over (method: change of variables).
+The state is what solves well (rotation matrix, line, normal and offset); the rows are what the
+paper prints: Euler angles z-y-x, beam angles and crossing point (5)-(6), plane vectors ``a`` (4).
+Units of the rows: px, mm, deg. The derivatives carry the covariance over (change of variables).
 
 Tangent coordinates (columns of the Jacobians), SI units:
 camera 15: rotation 3 and translation 3 in the camera frame, then the nine intrinsics;
@@ -12,6 +12,7 @@ plane 3: normal 2 along `tangent_basis`, distance.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +46,8 @@ AXES = "xyz"
 class BeamChart:
     """Which angles and which crossing point describe a beam.
 
-    ``polar``: the paper's (theta, phi); otherwise, for a beam along the hand's z axis where theta is
-    undefined, the tilts ``atan(ux/uz)``, ``atan(uy/uz)``. ``axis``: the coordinate plane that is
+    ``polar``: the paper's (theta, phi); otherwise, for a beam along the hand's z axis where theta
+    is undefined, the tilts ``atan(ux/uz)``, ``atan(uy/uz)``. ``axis``: the coordinate plane that is
     crossed; the paper's is x = 0 (axis 0).
     """
 
@@ -111,8 +112,7 @@ def beam_jacobian(beam: Beam, chart: BeamChart, frame: BeamFrame) -> Array:
     E = frame.R[:, :2]
     # u = R (a, b, 1) / norm: the step is projected across u and shrunk by the norm
     dU = (E - np.outer(u, u @ E)) * (u @ frame.R[:, 2])
-    a, b, x, y = frame.coordinates(u, beam.point_hand)
-    q = frame.t + frame.R @ np.array([x, y, 0.0])
+    q = frame.t + E @ frame.coordinates(u, beam.point_hand)[2:]
     i = chart.axis
     across = np.eye(3)
     across[:, i] -= u / u[i]
@@ -179,12 +179,12 @@ def row_jacobian(cell: Cell, charts: dict[str, BeamChart], frames: dict[str, Bea
 
 
 def tangent_labels(cell: Cell) -> tuple[str, ...]:
-    """Names of all tangent coordinates: ``camera.rot_x``, ``laser.slope_a``, ``plane 1.distance``."""
+    """Names of all tangent coordinates: ``camera.rot_x``, ``laser.slope_a``, ...."""
     labels = [f"{name}.{t}" for name in cell.cameras for t in CAMERA_TANGENT]
     labels += [f"{name}.{t}" for name in cell.lasers for t in BEAM_TANGENT]
     labels += [f"plane {name}.{t}" for name in cell.planes for t in PLANE_TANGENT]
     return tuple(labels)
 
 
-def _prefix(parts: dict[str, Camera] | dict[str, Beam], name: str) -> str:
+def _prefix(parts: Mapping[str, object], name: str) -> str:
     return f"{name}." if len(parts) > 1 else ""

@@ -27,8 +27,10 @@ _MAX_SHARE = 0.5
 
 
 def rejection_length(count: int) -> float:
-    """Length (sigmas) that the longest of ``count`` good residuals exceeds once in a thousand
-    captures: a quantile of the Rayleigh distribution, ``sqrt(-2 ln p)``."""
+    """Length (sigmas) that the longest of ``count`` good residuals rarely exceeds (`FALSE_ALARM`).
+
+    A quantile of the Rayleigh distribution, ``sqrt(-2 ln p)``.
+    """
     return float(np.sqrt(-2.0 * np.log(FALSE_ALARM / max(count, 1))))
 
 

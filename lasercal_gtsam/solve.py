@@ -136,8 +136,8 @@ def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> RangeSvd:
         raise DegenerateError(
             f"the spots leave {len(weak)} combination(s) of unknowns undetermined: "
             + "; ".join(f"({i + 1}) {w.words}" for i, w in enumerate(weak))
-            + ". Add hand orientations (at least three, not about one axis), longer translations or "
-            "a tilted plane, or hold what is known"
+            + ". Add hand orientations (at least three, not about one axis), longer translations "
+            "or a tilted plane, or hold what is known"
         )
     return svd
 
@@ -219,8 +219,8 @@ def _impossible(problem: CellGraph, cell: Cell) -> str | None:
     if not bad.any():
         return None
     return (
-        f"{int(bad.sum())} of {len(bad)} spots cannot be (beam away from its plane, behind the camera, "
-        f"or in the fold of the distortion); first: spot number {int(np.argmax(bad))}"
+        f"{int(bad.sum())} of {len(bad)} spots cannot be (beam away from its plane, behind the "
+        f"camera, or in the fold of the distortion); first: spot number {int(np.argmax(bad))}"
     )
 
 
@@ -284,6 +284,6 @@ def _radii(uv: Array, i: Intrinsics) -> Array:
 
 def _fold_words(i: Intrinsics, fold: float) -> str:
     return (
-        f"the distortion (k1 {i.k1:.3g}, k2 {i.k2:.3g}) folds {fold * i.fu:.0f} px from the principal "
-        "point,"
+        f"the distortion (k1 {i.k1:.3g}, k2 {i.k2:.3g}) folds {fold * i.fu:.0f} px from the "
+        "principal point,"
     )

@@ -13,6 +13,7 @@ from lasercal_factors.spot import Loss, SpotBatch
 
 from lasercal_gtsam.cell import Camera, Cell, Intrinsics
 from lasercal_gtsam.errors import DataError, LasercalError, SolveError
+from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import CellGraph, make_graph
 from lasercal_gtsam.holds import Holds
 from lasercal_gtsam.observations import Observations
@@ -111,9 +112,9 @@ def refine_candidates(
             break
     if not full:
         raise SolveError(
-            "no start could be refined: every closed-form candidate leaves spots behind the camera or "
-            "beams that miss their plane. Check the pose convention and units, the plane names, and "
-            "that laser and camera look at the same plane"
+            "no start could be refined: every closed-form candidate leaves spots behind the camera "
+            "or beams that miss their plane. Check the pose convention and units, the plane names, "
+            "and that laser and camera look at the same plane"
         )
     best = best_of(full)
     best = best_of([best, *_k2_restarts(search, best)])
@@ -123,8 +124,11 @@ def refine_candidates(
 
 
 def best_of(solutions: Iterable[Solution]) -> Solution:
-    """Plausible before implausible, then the lowest cost; a fold-free model is preferred to one that
-    folds beyond the spots where the data do not speak against it."""
+    """Plausible before implausible, then the lowest cost.
+
+    A model without a fold in the image is preferred to one that folds beyond the spots where the
+    data do not speak against it.
+    """
     ranked = sorted(solutions, key=lambda s: (len(s.troubles) > 0, s.cost))
     best = ranked[0]
     if fold_warnings(best.cell):
@@ -144,7 +148,7 @@ def fits_distortion(holds: Holds, cameras: int) -> bool:
 
 
 def _short_refinements(search: Search, candidates: Sequence[Cell]) -> list[Cell]:
-    """Stages (a) without distortion and (b) with k1, weak priors; cheapest first, doubles dropped."""
+    """Stages (a) without distortion and (b) with k1, weak priors; cheapest first, no doubles."""
     with_distortion = fits_distortion(search.holds, len(search.observations.cameras))
     priors = _stage_priors(search)
     stages = [replace(search.holds.without_distortion(), priors=priors)]
@@ -195,9 +199,11 @@ def _stage_priors(search: Search) -> dict[str, tuple[float, float]]:
         width, height = observations.image_size[name]
         spread = 0.12 * float(np.hypot(width, height))
         terms = {
-            "u0": (width / 2, spread), "v0": (height / 2, spread),
-            "skew": (0.0, 0.02), "aspect": (1.0, 0.05),
-        }  # fmt: skip
+            "u0": (width / 2, spread),
+            "v0": (height / 2, spread),
+            "skew": (0.0, 0.02),
+            "aspect": (1.0, 0.05),
+        }
         for term, prior in terms.items():
             tangent = "fu" if term == "aspect" else term
             if search.holds.held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(tangent)]:
@@ -252,10 +258,11 @@ def _quick_sigma(solution: Solution, column: int) -> float:
     return float(scale * np.sqrt(x @ unit[free])) if rank == free.sum() else float("inf")
 
 
-def _squared_radii(problem: CellGraph, camera_index: int, camera: Camera) -> np.ndarray:
+def _squared_radii(problem: CellGraph, camera_index: int, camera: Camera) -> Array:
     i: Intrinsics = camera.intrinsics
     uv = problem.spot_pixels(camera_index)
-    return np.asarray(((uv - [i.u0, i.v0]) / [i.fu, i.fv]) ** 2).sum(axis=1)
+    x = (uv - np.array([i.u0, i.v0])) / np.array([i.fu, i.fv])
+    return np.asarray((x**2).sum(axis=1))
 
 
 def _fewer_distortion_terms(

@@ -1,7 +1,7 @@
 """Sigmas: joint covariance, a-posteriori scale, Table 2's own parameters.
 
 The covariance comes from one singular value decomposition of the graph's square-root information,
-which also names the weak directions; it equals `gtsam.Marginals` (tested) and is better conditioned.
+which also names the weak directions. It equals `gtsam.Marginals` (tested), better conditioned.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ from lasercal_gtsam.solve import (
     free_columns,
     refuse_if_singular,
 )
-
 
 # residual scale below which data are exact and say nothing about their noise
 _EXACT = 1e-6
@@ -87,9 +86,12 @@ def table_parameters(
     variances = np.einsum("ij,jk,ik->i", F, uncertainty.covariance, F, optimize=True)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     rows = zip(
-        row_names(cell, charts), row_values(initial, charts), row_values(cell, charts), sigmas,
+        row_names(cell, charts),
+        row_values(initial, charts),
+        row_values(cell, charts),
+        sigmas,
         strict=True,
-    )  # fmt: skip
+    )
     return tuple(
         Parameter(name, float(before), float(after), float(sigma), unit)
         for (name, unit), before, after, sigma in rows

@@ -81,8 +81,11 @@ def _moved(values: gtsam.Values, key: int, i: int, h: float) -> gtsam.Values:
 
 def _insert(target: gtsam.Values, key: int, source: gtsam.Values) -> None:
     readers: tuple[Any, ...] = (
-        source.atPose3, source.atCal3DS2, source.atOrientedPlane3, source.atVector,
-    )  # fmt: skip
+        source.atPose3,
+        source.atCal3DS2,
+        source.atOrientedPlane3,
+        source.atVector,
+    )
     for read in readers:
         try:
             target.insert(key, read(key))

@@ -44,7 +44,7 @@ _inline = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inli
 
 
 @_jit
-def loss_value(kind: int, c: float, m: float) -> float:
+def loss_value(kind, c, m):
     """Robust loss of the squared whitened residual length ``m``; equals ``m`` for small ``m``."""
     if kind == LOSS_HUBER:
         return m if m <= c * c else 2.0 * c * math.sqrt(m) - c * c
@@ -56,7 +56,7 @@ def loss_value(kind: int, c: float, m: float) -> float:
 
 
 @_jit
-def loss_weight(kind: int, c: float, m: float) -> float:
+def loss_weight(kind, c, m):
     """Derivative of `loss_value`: the weight of the spot."""
     if kind == LOSS_HUBER:
         return 1.0 if m <= c * c else c / math.sqrt(m)
@@ -69,7 +69,7 @@ def loss_weight(kind: int, c: float, m: float) -> float:
 
 
 @_jit
-def _beam_in_hand(R, t, l):  # type: ignore[no-untyped-def]  # noqa: E741
+def _beam_in_hand(R, t, l):  # noqa: E741
     """Direction (not normalised) and point of a beam in hand coordinates."""
     u = np.empty(3)
     q = np.empty(3)
@@ -80,7 +80,7 @@ def _beam_in_hand(R, t, l):  # type: ignore[no-untyped-def]  # noqa: E741
 
 
 @_jit
-def tangent_basis(n):  # type: ignore[no-untyped-def]
+def tangent_basis(n):
     """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
     a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
     axis = np.zeros(3)
@@ -92,9 +92,12 @@ def tangent_basis(n):  # type: ignore[no-untyped-def]
         axis[2] = 1.0
     B = np.empty((3, 2))
     e = np.array(
-        [n[1] * axis[2] - n[2] * axis[1], n[2] * axis[0] - n[0] * axis[2],
-         n[0] * axis[1] - n[1] * axis[0]]
-    )  # fmt: skip
+        [
+            n[1] * axis[2] - n[2] * axis[1],
+            n[2] * axis[0] - n[0] * axis[2],
+            n[0] * axis[1] - n[1] * axis[0],
+        ]
+    )
     e /= math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     B[:, 0] = e
     B[0, 1] = n[1] * e[2] - n[2] * e[1]
@@ -104,7 +107,7 @@ def tangent_basis(n):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d):  # type: ignore[no-untyped-def]
+def _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d):
     """Beam in base and its hit on the plane (8), (9): direction, spot, 1/(n.u), length."""
     b0 = hands[0, k] * u0 + hands[1, k] * u1 + hands[2, k] * u2
     b1 = hands[3, k] * u0 + hands[4, k] * u1 + hands[5, k] * u2
@@ -118,7 +121,7 @@ def _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d):  # type: ignore[no-un
 
 
 @_inline
-def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
+def _distort(x, y, k1, k2, p1, p2):
     """Distorted coordinates, squared radius and radial factor."""
     r2 = x * x + y * y
     g = 1.0 + r2 * (k1 + k2 * r2)
@@ -128,7 +131,7 @@ def _distort(x, y, k1, k2, p1, p2):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _impossible(s, z, r2, k1, k2):  # type: ignore[no-untyped-def]
+def _impossible(s, z, r2, k1, k2):
     """1.0 where no spot can be, else 0.0.
 
     Beam parallel to or away from the plane, spot behind the camera, or beyond the radius where the
@@ -139,7 +142,7 @@ def _impossible(s, z, r2, k1, k2):  # type: ignore[no-untyped-def]
 
 
 @_jit_fast
-def _panel_residuals(pixels, hands, base, count, u, q, n, d, R, t, K, out):  # type: ignore[no-untyped-def]
+def _panel_residuals(pixels, hands, base, count, u, q, n, d, R, t, K, out):
     """Fill ``out`` (3, count): predicted minus seen pixel, and 1.0 where impossible."""
     u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
@@ -159,7 +162,7 @@ def _panel_residuals(pixels, hands, base, count, u, q, n, d, R, t, K, out):  # t
 
 
 @_jit_fast
-def _panel_loss(pixels, base, count, r, kind, c_loss):  # type: ignore[no-untyped-def]
+def _panel_loss(pixels, base, count, r, kind, c_loss):
     """(sum of the losses, impossible spots) of a panel's residuals ``r`` (3, count)."""
     total, bad = 0.0, 0.0
     for i in range(count):
@@ -173,7 +176,7 @@ def _panel_loss(pixels, base, count, r, kind, c_loss):  # type: ignore[no-untype
 
 
 @_inline
-def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):  # type: ignore[no-untyped-def]
+def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):
     """Whitened rows of spots base ... base+count-1 as columns of ``Q`` (24, 2 _PANEL).
 
     Column i holds the u row of spot base+i, column _PANEL+i its v row. Returns the number of
@@ -268,7 +271,7 @@ def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):  # t
 
 
 @_jit_fast
-def _add_products(Q, count, S):  # type: ignore[no-untyped-def]
+def _add_products(Q, count, S):
     """Add ``Q Q^T`` over the panel's first ``count`` spots to ``S`` (24, 24), upper 2x2 blocks.
 
     The rest of the panel is cleared: a loop of constant length is what the vector units want.
@@ -293,7 +296,7 @@ def _add_products(Q, count, S):  # type: ignore[no-untyped-def]
 
 
 @_jit_fast
-def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, kind, c_loss, S):  # type: ignore[no-untyped-def]
+def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, kind, c_loss, S):
     """Add ``[J r]^T [J r]`` of one block to ``S`` (24, 24); returns the impossible spots."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
     bad = 0.0
@@ -312,7 +315,7 @@ def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, k
 
 
 @_jit_fast
-def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):  # type: ignore[no-untyped-def]
+def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):
     """Fill ``out`` (N, 2, 23) with the rows of one block."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
     for base in range(first, last, _PANEL):
@@ -325,7 +328,7 @@ def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):  #
 
 
 @_jit
-def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]
+def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
     """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
     out = np.empty((pixels.shape[1], 2))
     for m in range(len(blocks)):
@@ -333,9 +336,19 @@ def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
         r = np.empty((3, last - first))
         _panel_residuals(
-            pixels, hands, first, last - first, u, q, plane_n[p], plane_d[p],
-            cam_R[c], cam_t[c], cam_K[c], r,
-        )  # fmt: skip
+            pixels,
+            hands,
+            first,
+            last - first,
+            u,
+            q,
+            plane_n[p],
+            plane_d[p],
+            cam_R[c],
+            cam_t[c],
+            cam_K[c],
+            r,
+        )
         for i in range(last - first):
             for j in range(2):
                 out[first + i, j] = r[j, i] if r[2, i] == 0.0 else np.nan
@@ -343,8 +356,21 @@ def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l
 
 
 @_jit
-def total_loss(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d,
-               kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+def total_loss(
+    pixels,
+    hands,
+    blocks,
+    cam_R,
+    cam_t,
+    cam_K,
+    beam_R,
+    beam_t,
+    beam_l,
+    plane_n,
+    plane_d,
+    kind,
+    c_loss,
+):
     """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
     r = np.empty((3, _PANEL))
     total, bad = 0.0, 0.0
@@ -354,9 +380,19 @@ def total_loss(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_
         for base in range(first, last, _PANEL):
             count = min(_PANEL, last - base)
             _panel_residuals(
-                pixels, hands, base, count, u, q, plane_n[p], plane_d[p],
-                cam_R[c], cam_t[c], cam_K[c], r,
-            )  # fmt: skip
+                pixels,
+                hands,
+                base,
+                count,
+                u,
+                q,
+                plane_n[p],
+                plane_d[p],
+                cam_R[c],
+                cam_t[c],
+                cam_K[c],
+                r,
+            )
             panel_total, panel_bad = _panel_loss(pixels, base, count, r, kind, c_loss)
             total += panel_total
             bad += panel_bad
@@ -364,22 +400,49 @@ def total_loss(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_
 
 
 @_jit
-def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):  # type: ignore[no-untyped-def]
+def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
     """Whitened Jacobian and residual of every spot, (N, 2, 23), possible or not."""
     out = np.empty((pixels.shape[1], 2, COLUMNS))
     for m in range(len(blocks)):
         c, l, p, first, last = blocks[m]  # noqa: E741
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
         _block_rows(
-            pixels, hands, first, last, u, q, beam_R[l], plane_n[p], plane_d[p],
-            tangent_basis(plane_n[p]), cam_R[c], cam_t[c], cam_K[c], out,
-        )  # fmt: skip
+            pixels,
+            hands,
+            first,
+            last,
+            u,
+            q,
+            beam_R[l],
+            plane_n[p],
+            plane_d[p],
+            tangent_basis(plane_n[p]),
+            cam_R[c],
+            cam_t[c],
+            cam_K[c],
+            out,
+        )
     return out
 
 
 @_jit
-def information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
-                plane_n, plane_d, kind, c_loss):  # type: ignore[no-untyped-def]  # fmt: skip
+def information(
+    pixels,
+    hands,
+    blocks,
+    offsets,
+    n,
+    cam_R,
+    cam_t,
+    cam_K,
+    beam_R,
+    beam_t,
+    beam_l,
+    plane_n,
+    plane_d,
+    kind,
+    c_loss,
+):
     """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
@@ -393,9 +456,23 @@ def information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, 
         u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
         S[:] = 0.0
         bad += _block_information(
-            pixels, hands, first, last, u, q, beam_R[l], plane_n[p], plane_d[p],
-            tangent_basis(plane_n[p]), cam_R[c], cam_t[c], cam_K[c], kind, c_loss, S,
-        )  # fmt: skip
+            pixels,
+            hands,
+            first,
+            last,
+            u,
+            q,
+            beam_R[l],
+            plane_n[p],
+            plane_d[p],
+            tangent_basis(plane_n[p]),
+            cam_R[c],
+            cam_t[c],
+            cam_K[c],
+            kind,
+            c_loss,
+            S,
+        )
         for i in range(6):
             column[i] = offsets[m, 0] + i
         for i in range(9):
@@ -415,7 +492,7 @@ def information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, 
 
 
 @_jit
-def constrain(H, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-def]
+def constrain(H, held, tie_from, tie_to, tie_ratio):
     """Apply ties and held columns to an augmented information in place (upper triangle).
 
     A tie makes the unknown ``from`` move as ``ratio`` times ``to``: its column is added to that of
@@ -446,7 +523,7 @@ def constrain(H, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-
 
 
 @_jit
-def cholesky(H):  # type: ignore[no-untyped-def]
+def cholesky(H):
     """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1); zero rows for null pivots."""
     size = len(H)
     Rt = np.zeros((size, size))
@@ -467,17 +544,48 @@ def cholesky(H):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def square_root_information(pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K,
-                            beam_R, beam_t, beam_l, plane_n, plane_d,
-                            kind, c_loss, held, tie_from, tie_to, tie_ratio):  # type: ignore[no-untyped-def]  # fmt: skip
+def square_root_information(
+    pixels,
+    hands,
+    blocks,
+    offsets,
+    n,
+    cam_R,
+    cam_t,
+    cam_K,
+    beam_R,
+    beam_t,
+    beam_l,
+    plane_n,
+    plane_d,
+    kind,
+    c_loss,
+    held,
+    tie_from,
+    tie_to,
+    tie_ratio,
+):
     """`information`, `constrain` and `cholesky` in one go: ``R`` (n+1, n+1), last column residual.
 
     [0, 0] is NaN where a spot cannot be.
     """
     H = information(
-        pixels, hands, blocks, offsets, n, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l,
-        plane_n, plane_d, kind, c_loss,
-    )  # fmt: skip
+        pixels,
+        hands,
+        blocks,
+        offsets,
+        n,
+        cam_R,
+        cam_t,
+        cam_K,
+        beam_R,
+        beam_t,
+        beam_l,
+        plane_n,
+        plane_d,
+        kind,
+        c_loss,
+    )
     if not math.isfinite(H[0, 0]):
         return H
     constrain(H, held, tie_from, tie_to, tie_ratio)

@@ -1,8 +1,8 @@
 """Factors for laser spots: one spot at a time, or all spots of a cell in one factor.
 
 Both say the same: predicted minus seen pixel (paper, eq. 55) of the chain beam -> plane -> camera.
-`LaserSpotFactor` is the textbook custom factor for a graph of your own. `LaserSpotBatchFactor` holds
-any number of spots; it hands GTSAM the square root of their information instead of their rows, so
+`LaserSpotFactor` is the textbook custom factor for a graph of your own. `LaserSpotBatchFactor`
+holds any number of spots; it hands GTSAM the square root of their information, not their rows, so
 that GTSAM's part of a linearisation does not depend on the number of spots.
 
 Variables
@@ -177,8 +177,8 @@ class SpotBatch:
         who = np.column_stack([np.asarray(x, dtype=np.int64) for x in (camera, laser, plane)])
         if not count or uv.shape != (count, 2) or T.shape != (count, 4, 4) or len(who) != count:
             raise FactorError(
-                f"spots: uv {uv.shape}, T_base_hand {T.shape}, {len(who)} indices; expected (N, 2), "
-                "(N, 4, 4) and N with N > 0"
+                f"spots: uv {uv.shape}, T_base_hand {T.shape}, {len(who)} indices; expected "
+                "(N, 2), (N, 4, 4) and N with N > 0"
             )
         order = np.lexsort((who[:, 2], who[:, 1], who[:, 0]))
         whitening = whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64))
@@ -285,8 +285,8 @@ def LaserSpotFactor(
     Returns
     -------
     gtsam.CustomFactor
-        Error: whitened predicted minus seen pixel, (2,). Infinite where the beam misses the plane or
-        the spot lies behind the camera.
+        Error: whitened predicted minus seen pixel, (2,). Infinite where the beam misses the plane
+        or the spot lies behind the camera.
 
     Raises
     ------
@@ -294,7 +294,9 @@ def LaserSpotFactor(
         Wrong shapes; or, from inside a solver, linearised at a state where no spot can be.
     """
     keys = CellKeys(((camera_key, intrinsics_key),), (laser_key,), (plane_key,), (frame,))
-    batch = SpotBatch.from_arrays([uv], [cov_uv], [T_base_hand], [0], [0], [0])
+    batch = SpotBatch.from_arrays(
+        np.asarray(uv)[None], np.asarray(cov_uv)[None], np.asarray(T_base_hand)[None], [0], [0], [0]
+    )
     w00, w01, w11 = batch.pixels[2:, 0]
 
     def error(values: Any) -> Array:
@@ -381,8 +383,13 @@ class Compressor:
         ratio = np.array([a for _, a in tied], dtype=np.float64)
         self._data = (batch.pixels, batch.hands, batch.blocks, offsets, keys.n)
         self._tail = (
-            LOSSES[loss.name], loss.threshold, mask, tie_from, tie_from + 1, ratio,
-        )  # fmt: skip
+            LOSSES[loss.name],
+            loss.threshold,
+            mask,
+            tie_from,
+            tie_from + 1,
+            ratio,
+        )
 
     def __call__(self, state: State) -> Array:
         """Upper triangular ``R`` (n+1, n+1), ``R.T R = [J r]^T [J r]``; last column the residual.
@@ -418,8 +425,13 @@ def whitening_from_covariance(cov: Array) -> Array:
     return out
 
 
-def keys_for(cameras: int, lasers: int, planes: int, frames: Sequence[BeamFrame],
-             aspects: Sequence[float | None] = ()) -> CellKeys:  # fmt: skip
+def keys_for(
+    cameras: int,
+    lasers: int,
+    planes: int,
+    frames: Sequence[BeamFrame],
+    aspects: Sequence[float | None] = (),
+) -> CellKeys:
     """Conventional keys: ``x`` camera pose, ``k`` intrinsics, ``l`` beam, ``p`` plane."""
     return CellKeys(
         tuple((gtsam.symbol("x", c), gtsam.symbol("k", c)) for c in range(cameras)),
