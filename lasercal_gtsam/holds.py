@@ -80,8 +80,8 @@ def resolve_holds(
     """Turn the options into masks and values for the parts that were observed.
 
     One plane seen by a camera: its skew and its principal point are held and weak priors are set,
-    as in the paper's section 3.3. The principal point is the known one, or that of a given ``initial``
-    cell, or the image centre (half width, half height).
+    as in section 3.3 of the paper. The principal point is the known one, or that of a given
+    ``initial`` cell, or the image centre (half width, half height).
 
     Raises
     ------
