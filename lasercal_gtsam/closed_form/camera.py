@@ -31,12 +31,14 @@ class KnownIntrinsics:
     principal_point : (u0, v0)
     skew : entry K[0, 1]
     aspect : f_u / f_v
+    focal_lengths : (f_u, f_v)
     centre : stands in for the principal point where the data cannot give it (the image centre)
     """
 
     principal_point: tuple[float, float] | None = None
     skew: float | None = None
     aspect: float | None = None
+    focal_lengths: tuple[float, float] | None = None
     centre: tuple[float, float] = (0.0, 0.0)
 
     def matrix(self, fu: float, fv: float) -> Array:
@@ -51,7 +53,9 @@ class KnownIntrinsics:
             K[:2, 2] = self.principal_point
         if self.skew is not None:
             K[0, 1] = self.skew
-        if self.aspect is not None:
+        if self.focal_lengths is not None:
+            K[0, 0], K[1, 1] = self.focal_lengths
+        elif self.aspect is not None:
             f = np.sqrt(K[0, 0] * K[1, 1])
             K[0, 0], K[1, 1] = f * np.sqrt(self.aspect), f / np.sqrt(self.aspect)
         return K
@@ -272,6 +276,10 @@ def cameras_from_points(
         with suppress(DegenerateError):
             camera = resection(views.points, views.xy)
             yield "DLT", impose(camera, known, views.points, views.xy)
+    if known.focal_lengths is not None:
+        with suppress(DegenerateError):
+            yield "known focal lengths", views.camera_with(known.matrix(*known.focal_lengths))
+        return
     if known.aspect is None:
         with suppress(DegenerateError):
             yield "zhang", views.camera_by_focal_lengths(known, None)

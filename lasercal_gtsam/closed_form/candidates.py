@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.closed_form.camera import KnownIntrinsics
 from lasercal_gtsam.closed_form.complete import complete_cell
-from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, find_groups
+from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, find_groups, thinned
+from lasercal_gtsam.closed_form.information import check_information
 from lasercal_gtsam.closed_form.pair import PairCandidate, solve_pair
 from lasercal_gtsam.closed_form.solution import NEGATIVE_DEPTH_PENALTY_PX, cell_reprojection
-from lasercal_gtsam.closed_form.spots import Spots, pixel_scaling
+from lasercal_gtsam.closed_form.spots import Spots, pairs_of, pixel_scaling
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.observations import Observations
 
@@ -55,6 +56,7 @@ def closed_form_candidates(
     principal_point: Mapping[str, tuple[float, float]] | None = None,
     skew: Mapping[str, float] | None = None,
     aspect: Mapping[str, float] | None = None,
+    focal_lengths: Mapping[str, tuple[float, float]] | None = None,
     group_tolerance_rad: float = GROUP_TOLERANCE_RAD,
 ) -> tuple[Candidate, ...]:
     """Solve a capture in closed form, without any guess: several starts, best first.
@@ -65,9 +67,11 @@ def closed_form_candidates(
 
     Parameters
     ----------
-    observations : the spots; pixels are taken without weights and without distortion
-    principal_point, skew, aspect : by camera name, where known: (u0, v0) px, px, f_u / f_v. A
-        camera that sees one plane only gets the image centre and no skew where they are not known
+    observations : the spots; pixels are taken without weights and without distortion. Of a pair
+        with more than 3000 spots an even choice is solved; all of them are ranked on
+    principal_point, skew, aspect, focal_lengths : by camera name, where known: (u0, v0) px, px,
+        f_u / f_v, (f_u, f_v) px. A camera that sees one plane only gets the image centre and no
+        skew where they are not known
     group_tolerance_rad : largest angle within a group of non-rotating motions; for poses read back
         from the robot about four times their rotation noise
 
@@ -87,19 +91,21 @@ def closed_form_candidates(
             (principal_point or {}).get(camera),
             (skew or {}).get(camera),
             (aspect or {}).get(camera),
+            (focal_lengths or {}).get(camera),
         )
         for camera, size in observations.image_size.items()
     }
     pairs: list[_Pair] = []
     reasons: list[str] = []
-    for camera, laser in sorted(set(zip(observations.camera, observations.laser, strict=True))):
-        spots = Spots.of_pair(observations, camera, laser)
+    for camera, laser in pairs_of(observations):
+        everything = Spots.of_pair(observations, camera, laser)
+        spots = thinned(everything, tolerance_rad=group_tolerance_rad)
         try:
             found = solve_pair(spots, find_groups(spots, group_tolerance_rad), known[camera])
         except DegenerateError as error:
-            reasons.append(f"camera {str(camera)!r} with laser {str(laser)!r}: {error}")
+            reasons.append(f"camera {camera!r} with laser {laser!r}: {error}")
             continue
-        pairs.append(_Pair(str(camera), str(laser), spots, found))
+        pairs.append(_Pair(camera, laser, everything, found))
     if not pairs:
         raise DegenerateError("\n".join(reasons) or "there are no spots")
     pairs.sort(key=lambda pair: len(pair.spots))
@@ -116,7 +122,9 @@ def closed_form_candidates(
         candidates.append(Candidate(cell, rms, chosen[-1].method, negative))
     if not candidates and refusal:
         raise refusal
-    return tuple(sorted(candidates, key=lambda candidate: candidate.rank))
+    candidates.sort(key=lambda candidate: candidate.rank)
+    check_information(candidates[0].cell, observations, known, candidates[0].rms_px)
+    return tuple(candidates)
 
 
 def _known(
@@ -124,13 +132,19 @@ def _known(
     principal_point: tuple[float, float] | None,
     skew: float | None,
     aspect: float | None,
+    focal_lengths: tuple[float, float] | None,
 ) -> KnownIntrinsics:
     """Known intrinsics in scaled pixels."""
     scaling = pixel_scaling(size)
     if principal_point is not None:
         u, v, _ = scaling @ (*principal_point, 1.0)
         principal_point = float(u), float(v)
-    return KnownIntrinsics(principal_point, None if skew is None else skew * scaling[0, 0], aspect)
+    scale = float(scaling[0, 0])
+    if focal_lengths is not None:
+        focal_lengths = scale * focal_lengths[0], scale * focal_lengths[1]
+    return KnownIntrinsics(
+        principal_point, None if skew is None else scale * skew, aspect, focal_lengths
+    )
 
 
 def _merged(pairs: list[_Pair], chosen: list[PairCandidate]) -> Cell:

@@ -16,6 +16,7 @@ from lasercal_gtsam.rotations import nearest_rotation
 from lasercal_gtsam.units import RAD_PER_DEG
 
 GROUP_TOLERANCE_RAD = 0.05 * RAD_PER_DEG
+MOST_SPOTS = 3000
 SMALLEST_GROUP = 4
 """Four shots fix the homography of a group."""
 
@@ -125,3 +126,29 @@ def find_groups(spots: Spots, tolerance_rad: float = GROUP_TOLERANCE_RAD) -> Gro
         R[g] = spots.R[rows].mean(axis=0)
     plane = np.array([spots.plane[rows[0]] for rows in members], dtype=np.int64)
     return Groups(nearest_rotation(R) if len(R) else R, plane, xy, t, present)
+
+
+def thinned(
+    spots: Spots, most: int = MOST_SPOTS, tolerance_rad: float = GROUP_TOLERANCE_RAD
+) -> Spots:
+    """At most about ``most`` spots, evenly over planes and groups, whole groups where possible.
+
+    A start gains nothing from more, and the cost of the stages grows with their number.
+    """
+    if len(spots) <= most:
+        return spots
+    labels = group_labels(spots.R, spots.plane, tolerance_rad)
+    kept: list[Index] = []
+    for p in range(spots.plane_count):
+        rows = spots.on_plane(p)
+        budget = max(-(-most * len(rows) // len(spots)), min(len(rows), 200))
+        members = np.split(
+            rows[np.argsort(labels[rows], kind="stable")],
+            np.cumsum(np.unique(labels[rows], return_counts=True)[1])[:-1],
+        )
+        step = max(1, len(rows) // budget)
+        if len(members) >= 10 * step:
+            kept += members[::step]
+        else:
+            kept += [group[::step] for group in members]
+    return spots.subset(np.sort(np.concatenate(kept)))

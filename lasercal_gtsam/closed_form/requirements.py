@@ -12,19 +12,15 @@ from __future__ import annotations
 import numpy as np
 
 from lasercal_gtsam.closed_form.groups import group_labels
-from lasercal_gtsam.closed_form.linear import null_vector_and_gap
 from lasercal_gtsam.closed_form.spots import Spots
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.rotations import basis_of
 from lasercal_gtsam.units import MM_PER_M, RAD_PER_DEG
 
 DISTINCT_ORIENTATION_RAD = 0.5 * RAD_PER_DEG
 SMALLEST_TURN_RAD = 0.25 * RAD_PER_DEG
 """Rms turn about an axis below which the hand counts as not turned about it."""
 SMALLEST_MOTION_M = 1e-4
-SMALLEST_TRANSLATION_GAP = 1e-3
-"""Of `translation_gap`; beams within about half a degree of each other fall below."""
 _THREE = (
     "three or more hand orientations are needed, turned by 20 deg or more about two axes or more"
 )
@@ -79,13 +75,14 @@ def check_orientations(R: Array) -> None:
     if s[2] / np.sqrt(len(R)) < SMALLEST_TURN_RAD:
         axis = ", ".join(f"{x:.3f}" for x in Vt[2])
         what = (
-            "the shots have only two hand orientations"
+            f"the shots have only two hand orientations, one turned about ({axis}, hand frame) "
+            "against the other"
             if count == 2
             else f"all hand orientations turn about one axis ({axis} in the hand frame)"
         )
         raise DegenerateError(
-            f"{what}, so a shift along that axis stays free: {_THREE}; add a few shots tilted "
-            f"about another axis"
+            f"{what}, so a shift of everything along that axis stays free: {_THREE}; add a few "
+            "shots tilted about another axis"
         )
 
 
@@ -107,45 +104,6 @@ def check_translations(R: Array, t: Array) -> None:
             f"{left * MM_PER_M:.2g} mm), which gives no scale: translate it by several centimetres "
             "between shots"
         )
-
-
-def translation_gap(R: Array, t: Array, u: Array) -> float:
-    """How well poses and direction determine scale, camera position and beam point together.
-
-    Ratio of the smallest to the largest singular value of the column-scaled system
-    ``E_u' R_k' (s t_k + w) - tau`` (2N x 6), the one-plane translation step.
-    """
-    B = R @ basis_of(u)
-    rows = np.zeros((len(R), 2, 6))
-    rows[:, :, 0] = ((t - t.mean(axis=0))[:, None, :] @ B)[:, 0]
-    rows[:, :, 1:4] = np.swapaxes(B, 1, 2)
-    rows[:, :, 4:] = -np.eye(2)
-    A = rows.reshape(-1, 6)
-    scale = np.linalg.norm(A, axis=0)
-    s = np.linalg.svd(A / np.where(scale > 0, scale, 1.0), compute_uv=False)
-    return float(s[-1] / s[0])
-
-
-def check_beam(R: Array, t: Array, u: Array) -> None:
-    """Refuse poses that only turn the hand about the beam, once the direction is known.
-
-    Raises
-    ------
-    DegenerateError
-        `translation_gap` is below `SMALLEST_TRANSLATION_GAP`.
-    """
-    if translation_gap(R, t, u) >= SMALLEST_TRANSLATION_GAP:
-        return
-    beams = R @ u
-    if null_vector_and_gap(beams)[1] < SMALLEST_TURN_RAD:
-        raise DegenerateError(
-            "the hand only turns about the laser beam, so all beams are parallel and a shift along "
-            "them stays free: tilt the hand so that the beam turns by 20 deg or more"
-        )
-    raise DegenerateError(
-        "the motions across the beam leave scale, camera position or beam point free: "
-        "translate the hand by several centimetres across the beam, with three orientations or more"
-    )
 
 
 def _planes(count: int) -> str:

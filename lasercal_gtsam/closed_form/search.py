@@ -14,6 +14,7 @@ import numpy as np
 from lasercal_gtsam.closed_form.beam_fit import refine_beam
 from lasercal_gtsam.closed_form.direction import best_distinct_index, hemisphere
 from lasercal_gtsam.closed_form.triangulation import DISTINCT_BEAMS_RAD, PlaneSpots, solvable_planes
+from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.units import RAD_PER_DEG
 
@@ -78,10 +79,21 @@ def trial_directions(planes: list[PlaneSpots], keep: int = 6) -> Array:
 
 
 def search_beams(planes: list[PlaneSpots], keep: int = 4) -> list[tuple[Array, Array]]:
-    """Beams (u, q) that fit the spots of all planes best, from no start, best first."""
+    """Beams (u, q) that fit the spots of all planes best, from no start, best first.
+
+    Raises
+    ------
+    DegenerateError
+        The planes with two hand orientations or more have too few spots: fewer equations than
+        unknowns (11 a plane and 4 of the beam).
+    """
     planes = [plane for plane in planes if _orientation_spread(plane) > DISTINCT_BEAMS_RAD]
-    if not planes:
-        return []
+    surplus = sum(2 * len(plane) - 11 for plane in planes)
+    if surplus < 4:
+        raise DegenerateError(
+            "the search without groups needs 8 spots or more on one plane, or 7 on each of two, "
+            "made with different hand orientations, and 10 or more are advisable"
+        )
     found = []
     for u in trial_directions(planes):
         usable = solvable_planes(planes, u)

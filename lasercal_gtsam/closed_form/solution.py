@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
-from lasercal_gtsam.closed_form.spots import Spots
+from lasercal_gtsam.closed_form.spots import Spots, pairs_of
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.rotations import make_pose, nearest_rotation
@@ -124,7 +124,7 @@ def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
 def cell_reprojection(cell: Cell, observations: Observations) -> tuple[float, float]:
     """`reprojection` over all pairs of a capture; the cell must have all their parts."""
     squared = behind = 0.0
-    for camera, laser in sorted(set(zip(observations.camera, observations.laser, strict=True))):
+    for camera, laser in pairs_of(observations):
         spots = Spots.of_pair(observations, camera, laser)
         rms, negative = reprojection(Solution.of_cell(cell, spots, camera, laser), spots)
         squared += len(spots) * rms**2

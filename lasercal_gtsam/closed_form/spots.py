@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +61,12 @@ class Spots:
     def __len__(self) -> int:
         return len(self.xy)
 
+    def subset(self, rows: Index) -> Spots:
+        """Select spots by index; the planes stay numbered as they are."""
+        return replace(
+            self, xy=self.xy[rows], R=self.R[rows], t=self.t[rows], plane=self.plane[rows]
+        )
+
     @property
     def plane_count(self) -> int:
         """Number of planes."""
@@ -69,6 +75,13 @@ class Spots:
     def on_plane(self, p: int) -> Index:
         """Indices of the spots on plane ``p``."""
         return np.flatnonzero(self.plane == p)
+
+
+def pairs_of(observations: Observations) -> list[tuple[str, str]]:
+    """The (camera, laser) pairs that have spots, in order of their names."""
+    count = len(observations.lasers)
+    codes = np.unique(observations.camera_index * count + observations.laser_index)
+    return [(observations.cameras[i // count], observations.lasers[i % count]) for i in codes]
 
 
 def image_centre(image_size: tuple[int, int]) -> tuple[float, float]:
