@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -48,6 +49,8 @@ def find_candidates(difference: Difference, threshold_sigmas: float) -> Candidat
     ):
         sigma = max(gain * difference.noise, _spread(response))
         mask |= response > threshold_sigmas * sigma + 3 * difference.clutter
+    # a bump in a hollow, or the rim of one, has no light of its own
+    mask &= fine > threshold_sigmas * _noise_gain(FINE) * difference.noise
     return Candidates(_ranked(mask, fine), fine)
 
 
@@ -59,8 +62,7 @@ def _ranked(mask: Mask, blurred: Image) -> tuple[Candidate, ...]:
     label, height = labels[v, u], blurred[v, u]
     order = np.lexsort((u, v, -height, label))
     first = order[np.r_[True, np.diff(label[order]) > 0]]
-    # a bump in a dark hollow has no light of its own
-    found = [Candidate(int(u[i]), int(v[i]), float(height[i])) for i in first if height[i] > 0]
+    found = [Candidate(int(u[i]), int(v[i]), float(height[i])) for i in first]
     return tuple(sorted(found, key=lambda c: (-c.peak, c.v, c.u)))
 
 
@@ -78,10 +80,10 @@ def _coarse_blur(image: Image) -> Image:
     return np.asarray(cv2.resize(small, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
-def _noise_gain(inner: float, outer: float) -> float:
-    """Standard deviation of white unit noise after a difference of Gaussians."""
+def _noise_gain(inner: float, outer: float = math.inf) -> float:
+    """Standard deviation of white unit noise after a Gaussian blur, or a difference of two."""
     variance = 1 / inner**2 + 1 / outer**2 - 4 / (inner**2 + outer**2)
-    return float(np.sqrt(variance / (4 * np.pi)))
+    return math.sqrt(variance / (4 * math.pi))
 
 
 def _spread(response: Image) -> float:

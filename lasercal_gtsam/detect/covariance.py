@@ -11,7 +11,7 @@ from lasercal_gtsam.detect.centre import CORE, PROFILE_ERROR, SpotFit
 from lasercal_gtsam.frozen import Array
 
 # centre error per radius of the clipped core: what is clipped hides a shifted flare
-SATURATION_ERROR = 0.06
+SATURATION_ERROR = 0.05
 
 
 # a small spot holds few grains and tells little of its own speckle: then laser light is supposed

@@ -174,8 +174,8 @@ def cut_patch(
     """Cut out a box (u0, v0, width, height) and its surroundings, albedo divided out if asked.
 
     Ambient light shows the reflectance of the surface: relative to its median in the box it
-    divides the laser's light. Left alone where the off frame is too dark (10 sigma), or varies so
-    much that it must be a highlight or a deep shadow and no print.
+    divides the laser's light. Left alone where the off frame is too dark (10 sigma), shows nothing
+    but its noise, or varies so much that it must be a highlight or a deep shadow and no print.
     """
     u0, v0, width, height = box
     rows = slice(max(v0 - margin, 0), min(v0 + height + margin, difference.light.shape[0]))
@@ -190,7 +190,10 @@ def cut_patch(
     )
     reference = float(np.median(ambient))
     low, high = float(ambient.min()), float(ambient.max())
-    if low < 10 * difference.off_noise or high > _ALBEDO_RANGE * low:
+    # white noise after a Gaussian blur
+    noise = difference.off_noise / (2 * np.sqrt(np.pi) * _ALBEDO_BLUR)
+    blank = float(ambient.std()) < 1.5 * noise
+    if blank or low < 10 * difference.off_noise or high > _ALBEDO_RANGE * low:
         return Patch(light, variance, corner, divided=False)
     albedo = _image(ambient / np.float32(reference))
     return Patch(_image(light / albedo), _image(variance / albedo**2), corner, divided=True)

@@ -16,10 +16,12 @@ from lasercal_gtsam.detect.gaussian import Mask
 from lasercal_gtsam.detect.guard import CORE_LEVEL, Centre, choose_centre
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.detect.picture import Frames
-from lasercal_gtsam.detect.region import LEVEL, Region, find_region, squared_distance
+from lasercal_gtsam.detect.region import Region, find_region, squared_distance
 from lasercal_gtsam.frozen import Array
 
 RIVAL_SIGMAS = 2.5  # light beyond this is not the spot's own
+_FILL_BLUR = 0.6  # of the minor sigma
+_BRIGHT_LEVEL = 0.1
 _CLIPPED_DIVIDE = 0.1  # of the spot's pixels
 _MARGIN = 12  # px of surroundings that are looked at beside the spot
 
@@ -39,9 +41,9 @@ class Measurement:
     box, area
         Bounding box (u0, v0, width, height) and number of pixels above 20 % of the peak.
     bright_area
-        The same without the blur that all else is seen through: a hot pixel has one.
+        Pixels above 10 % of the peak without the blur that all else is seen through.
     fill
-        Light at the centre over the most in the spot.
+        Light at the centre over the most in the spot, after a blur that speckle does not survive.
     beside, beside_uv
         Strongest light beyond 2.5 sigma in the surroundings, over the spot's, and where.
     """
@@ -100,8 +102,8 @@ def measure_spot(
         saturated_share=n_saturated / core.area,
         box=(u0 + patch.corner[0], v0 + patch.corner[1], width, height),
         area=region.area,
-        bright_area=_bright_area(patch.light, region),
-        fill=_at(smooth, centre.uv) / again.peak,
+        bright_area=_bright_area(patch.light, region, difference.noise),
+        fill=_fill(patch.light, region, centre),
         beside=beside,
         beside_uv=beside_uv + corner,
     )
@@ -117,7 +119,7 @@ def _too_large(frames: Frames, blurred: Image, candidate: Candidate, whole: Regi
         box=whole.box,
         area=whole.area,
         bright_area=whole.area,
-        fill=_at(blurred, whole.centroid) / candidate.peak,
+        fill=1.0,
         beside=0.0,
         beside_uv=whole.centroid,
     )
@@ -137,12 +139,22 @@ def _slices(region: Region) -> tuple[slice, slice]:
     return slice(v0, v0 + height), slice(u0, u0 + width)
 
 
-def _bright_area(light: Image, region: Region) -> int:
-    """Pixels that connect to the brightest one of the region above 20 % of it, without a blur."""
+def _bright_area(light: Image, region: Region, noise: float) -> int:
+    """Pixels that connect to the region's brightest one above 10 % of it, without a blur.
+
+    A spot of sigma 0.5 px has five; a hot pixel has one, as long as the noise is kept out.
+    """
     inside = np.where(region.mask, light[_slices(region)], 0)
-    above: Mask = inside > LEVEL * inside.max()
+    above: Mask = inside > max(_BRIGHT_LEVEL * float(inside.max()), 3 * noise)
+    above.flat[int(np.argmax(inside))] = True
     _, labels = cv2.connectedComponents(above.view(np.uint8), connectivity=8)
     return int(np.count_nonzero(labels == labels.ravel()[int(np.argmax(inside))]))
+
+
+def _fill(light: Image, region: Region, centre: Centre) -> float:
+    sigma = _FILL_BLUR * float(np.sqrt(np.linalg.eigvalsh(centre.shape)[0]))
+    smooth = _smooth(light, max(sigma, FINE))
+    return _at(smooth, centre.uv) / float(smooth[_slices(region)][region.mask].max())
 
 
 def _at(image: Image, uv: Array) -> float:
@@ -169,5 +181,5 @@ def _light_beside(
     return max(float(rest[y, x]) / max(own, 1e-12), 0.0), np.array([float(x), float(y)])
 
 
-def _smooth(image: Image) -> Image:
-    return np.asarray(cv2.GaussianBlur(image, (0, 0), FINE, borderType=cv2.BORDER_REPLICATE))
+def _smooth(image: Image, sigma: float = FINE) -> Image:
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE))

@@ -39,7 +39,8 @@ class DetectionOptions:
     edge_margin_px
         A spot whose centre (or whose 20 % contour) comes nearer than this to the edge is not used.
     min_area_px, max_area_px
-        Number of pixels above 20 % of the peak that a spot may have.
+        Number of pixels that a spot may have: at least so many above 10 % of its peak, at most so
+        many above 20 % after a blur.
     max_elongation
         Largest ratio of the spot's axes.
     max_saturated_share
