@@ -6,7 +6,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import click
@@ -52,15 +52,32 @@ def bullets(lines: Sequence[str]) -> list[str]:
 
 @contextmanager
 def progress(label: str) -> Iterator[Progress]:
-    """Give a function (done, total) that draws a progress bar on stderr if that is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda done, total: None
-        return
+    """Give a function (done, total) that draws a progress bar on stderr if that is a terminal.
+
+    The bar, and what draws it, come with the first call: often there is nothing to wait for.
+    """
+    with ExitStack() as stack:
+        draw: Progress | None = None
+
+        def show(done: int, total: int) -> None:
+            nonlocal draw
+            if draw is None:
+                draw = _start_bar(label, stack)
+            draw(done, total)
+
+        yield show if sys.stderr.isatty() else _be_silent
+
+
+def _be_silent(done: int, total: int) -> None:
+    pass
+
+
+def _start_bar(label: str, stack: ExitStack) -> Progress:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as Bar
 
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bar(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+    bar = stack.enter_context(Bar(*columns, console=Console(stderr=True), transient=True))
+    task = bar.add_task("", total=None)
+    return lambda done, total: bar.update(task, completed=done, total=total)

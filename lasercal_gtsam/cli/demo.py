@@ -28,10 +28,10 @@ PRESET = "paper-distorted"
 HAND_MM, HAND_DEG = 0.05, 0.005
 
 _CONTENTS = {
-    "capture.yaml": "what the capture is: camera, pose convention, pictures, noise",
+    "capture.yaml": "camera, pose convention, where the pictures are, noise",
     "poses.csv": "the hand poses, as a controller reports them",
     "images/": "the pictures, laser on and laser off",
-    SPOTS_FILE: "what was found in each picture, with the reason where nothing was",
+    SPOTS_FILE: "what was found in each picture, or why nothing was",
     SHEET_FILE: "every spot enlarged, to be looked at",
     CALIBRATION_FILE: "the result with everything that made it",
     "truth.json": "the cell that the pictures were made of",
@@ -121,9 +121,13 @@ def truth_table(result: Calibration, rows: Sequence[Comparison]) -> str:
     for parameter, truth, sigmas in rows:
         *cells, unit = table_row(parameter)
         true = plain_number(truth, table_decimals(parameter))
-        lines.append((*cells, true, f"{sigmas:+.1f}" if math.isfinite(sigmas) else "", unit))
+        lines.append((*cells, true, _signed(sigmas), unit))
     lines.append(("RMS", "", f"{result.fit.rms_px:.4g}", "", "", "", "px"))
     return text_table(lines)
+
+
+def _signed(sigmas: float) -> str:
+    return f"{round(sigmas, 1) + 0.0:+.1f}" if math.isfinite(sigmas) else ""
 
 
 def _take_pictures(out: Path, seed: int, force: bool) -> None:
@@ -153,8 +157,9 @@ def _report(
     usable = sum(account.usable)
     return [
         wrapped(
-            f"Simulated: {len(capture)} hand poses on {planes} planes, with a picture each with the "
-            f"laser on and off. The hand repeats to {HAND_MM:g} mm and {HAND_DEG:g} deg."
+            f"Simulated: {len(capture)} hand poses on {planes} planes, each with a picture with "
+            "the laser on and one with it off. The hand repeats to "
+            f"{HAND_MM:g} mm and {HAND_DEG:g} deg."
         ),
         wrapped(
             f"Detected: {usable} of {count(looked_at(account), 'picture')} gave a spot"

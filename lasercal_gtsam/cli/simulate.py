@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from lasercal_gtsam.cli.console import json_option, print_json, progress, wrapped
+from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
 from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.cli.texts import count
 from lasercal_gtsam.cli.values import PresetName, RotationName
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.simulate.pictures import PictureOptions
 
 _NOT_NEGATIVE = click.FloatRange(min=0)
+_WRITTEN = {"capture.yaml", "poses.csv", "truth.json", "images"}
 
 
 class _WithPresets(click.Command):
@@ -163,6 +164,9 @@ def simulate(
                 progress=show,
             )
     seen = made.observations
+    others = sorted({path.name for path in out.iterdir()} - _WRITTEN)
+    if others:
+        warn([f"{', '.join(others)} in {out} are not of this capture and were left as they are"])
     if as_json:
         print_json(
             {
