@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from lasercal_factors.spot import Loss, SpotBatch
+from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.calibration import (
     Calibration,
@@ -18,7 +18,7 @@ from lasercal_gtsam.calibration import (
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import make_batch
+from lasercal_gtsam.graph import make_batch, state_from_cell
 from lasercal_gtsam.hand_noise import adjusted_batch
 from lasercal_gtsam.holds import resolve_holds
 from lasercal_gtsam.observations import Observations
@@ -106,16 +106,14 @@ def assemble(
     uncertainty = estimate_uncertainty(solution)
     problem = solution.problem
     cell = _with_unobserved(solution.cell, start)
-    residuals = batch.residuals(problem.keys.read(problem.values(solution.cell)))
+    residuals = batch.residuals(state_from_cell(solution.cell))
     used = np.array([reason is None for reason in reasons])
     warnings = fold_warnings(solution.cell)
     fit = _fit(solution, uncertainty, residuals[used], int((~used).sum()), warnings)
     return Calibration(
         cell=cell,
         initial=start,
-        parameters=table_parameters(
-            solution.cell, _restricted(start, solution.cell), uncertainty, problem
-        ),
+        parameters=table_parameters(solution.cell, _restricted(start, solution.cell), uncertainty),
         covariance=uncertainty.covariance,
         labels=uncertainty.labels,
         fit=fit,

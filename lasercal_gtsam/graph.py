@@ -1,7 +1,7 @@
-"""The factor graph of a cell: keys, state <-> `gtsam.Values`, observations -> factors.
+"""The factor graph of a cell: observations -> factors, state <-> variables.
 
-The only module that reads or writes `gtsam.Values`; also the only one that knows that
-`gtsam.OrientedPlane3` stores ``n.x + d = 0`` where we write ``n.x = d``.
+One vector variable holds a whole cell about its start (`lasercal_factors.chart`), with one factor
+for all spots and one for all priors. The only module that reads or writes `gtsam.Values`.
 """
 
 from __future__ import annotations
@@ -12,15 +12,10 @@ from typing import Any
 
 import gtsam
 import numpy as np
+import numpy.typing as npt
+from lasercal_factors.batch import Loss, SpotBatch, State
 from lasercal_factors.beam import BeamFrame
-from lasercal_factors.spot import (
-    CellKeys,
-    LaserSpotBatchFactor,
-    Loss,
-    SpotBatch,
-    State,
-    keys_for,
-)
+from lasercal_factors.chart import CellChart, LaserCellFactor
 from lasercal_factors.wrap import custom_factor
 
 from lasercal_gtsam import report_map
@@ -29,8 +24,10 @@ from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.holds import Holds, check_prior_names
 from lasercal_gtsam.observations import Observations
-from lasercal_gtsam.report_map import BeamChart
+from lasercal_gtsam.report_map import CAMERA_TANGENT, BeamChart
 from lasercal_gtsam.rotations import make_pose
+
+CELL_KEY = gtsam.symbol("z", 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,71 +37,73 @@ class CellGraph:
     Attributes
     ----------
     batch : the spots, whitened with their a-priori covariance
-    keys : variables; beams are written about the start's beams
     holds : what is not free
-    start : the cell the charts are anchored at (all observed parts, in the observations' order)
+    start : the cell the chart is about (all observed parts, in the observations' order)
     loss : robust loss
     scale : factor on the a-priori pixel sigmas (matters against priors only)
     """
 
     batch: SpotBatch
-    keys: CellKeys
     holds: Holds
     start: Cell
     loss: Loss
     scale: float = 1.0
 
     @cached_property
-    def charts(self) -> dict[str, BeamChart]:
-        """Report charts of the beams, those of the start."""
-        return {name: BeamChart.of(beam) for name, beam in self.start.lasers.items()}
+    def chart(self) -> CellChart:
+        """Coordinates about the start, in the order of `report_map.tangent_labels`."""
+        aspects = tuple(self.holds.aspect.get(name) for name in self.start.cameras)
+        return CellChart(state_from_cell(self.start), aspects)
+
+    @cached_property
+    def free(self) -> npt.NDArray[np.bool_]:
+        """(n,) booleans: coordinates that are estimated (of tied focal lengths ``fv`` is)."""
+        free = ~self.holds.held
+        for c, aspect in enumerate(self.chart.aspects):
+            if aspect is not None:
+                free[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("fu")] = False
+        return free
 
     @cached_property
     def graph(self) -> gtsam.NonlinearFactorGraph:
-        """Batch factor of all spots, and one factor with all priors."""
+        """One factor with all spots, and one with all priors."""
         graph = gtsam.NonlinearFactorGraph()
         batch = self.batch if self.scale == 1.0 else self.batch.scaled(self.scale)
-        graph.add(LaserSpotBatchFactor(self.keys, batch, self.loss, self.holds.held))
+        graph.add(LaserCellFactor(CELL_KEY, self.chart, batch, self.loss, self.holds.held))
         if self.holds.priors:
-            graph.add(_prior_factor(self.keys, self.holds, self.start, self.charts))
+            graph.add(_prior_factor(self.chart, self.holds, self.start))
         return graph
 
-    def values(self, cell: Cell | None = None) -> gtsam.Values:
-        """Values of a cell (the start if left out)."""
-        cell = self.start if cell is None else cell
+    def start_values(self) -> gtsam.Values:
+        """Values of the start: the chart's origin."""
         values = gtsam.Values()
-        for (x, k), camera in zip(self.keys.cameras, cell.cameras.values(), strict=True):
-            values.insert(x, gtsam.Pose3(camera.T_base_camera))
-            values.insert(k, camera.intrinsics.to_gtsam())
-        lasers = zip(self.keys.lasers, self.keys.frames, cell.lasers.values(), strict=True)
-        for key, frame, beam in lasers:
-            values.insert(key, frame.coordinates(beam.direction_hand, beam.point_hand))
-        for key, plane in zip(self.keys.planes, cell.planes.values(), strict=True):
-            a, b, c = plane.normal_base
-            values.insert(key, gtsam.OrientedPlane3(a, b, c, -plane.distance))
+        values.insert(CELL_KEY, np.zeros(self.chart.n))
         return values
+
+    def state(self, values: gtsam.Values) -> State:
+        """Plain arrays of the values."""
+        return self.chart.state(values.atVector(CELL_KEY))
 
     def cell(self, values: gtsam.Values) -> Cell:
         """The cell of the values, names and image sizes from the start."""
-        return cell_from_state(self.keys.read(values), self.start, self.keys.frames)
+        return cell_from_state(self.state(values), self.start)
 
     def rescaled(self, scale: float) -> CellGraph:
         """The same problem with the a-priori pixel sigmas multiplied by ``scale``."""
         return replace(self, scale=scale)
 
     def anchored(self, cell: Cell) -> CellGraph:
-        """The same problem with its charts anchored at ``cell``."""
-        frames = _frames(cell)
-        return replace(self, start=cell, keys=replace(self.keys, frames=frames))
+        """The same problem with its chart about ``cell``."""
+        return replace(self, start=cell)
+
+    def rows(self, values: gtsam.Values) -> Array:
+        """Square-root information of spots and priors at the values, (rows, n), in sigmas."""
+        return np.asarray(self.graph.linearize(values).jacobian()[0])
 
     def spot_pixels(self, camera: int) -> Array:
         """Seen pixels of the camera with that index, (M, 2)."""
         parts = [self.batch.pixels[:2, b[3] : b[4]] for b in self.batch.blocks if b[0] == camera]
         return np.concatenate(parts, axis=1).T if parts else np.empty((0, 2))
-
-    def residuals(self, cell: Cell) -> Array:
-        """Predicted minus seen pixel of each spot in input order, (N, 2); NaN where impossible."""
-        return self.batch.residuals(self.keys.read(self.values(cell)))
 
 
 def make_batch(observations: Observations, sigma_px: float | None) -> SpotBatch:
@@ -138,16 +137,28 @@ def make_graph(
         A part has spots but is not in the start, or an image size differs.
     """
     start = holds.apply(_ordered(start, observations))
-    frames = _frames(start)
-    aspects = tuple(holds.aspect.get(name) for name in start.cameras)
-    keys = keys_for(len(start.cameras), len(frames), len(start.planes), frames, aspects)
-    problem = CellGraph(batch, keys, holds, start, loss or Loss())
     if holds.priors:
-        check_prior_names(holds, start, problem.charts)
-    return problem
+        check_prior_names(holds, start)
+    return CellGraph(batch, holds, start, loss or Loss())
 
 
-def cell_from_state(state: State, template: Cell, frames: tuple[BeamFrame, ...]) -> Cell:
+def state_from_cell(cell: Cell) -> State:
+    """Plain arrays of a cell; each beam is written about itself."""
+    cameras, planes = cell.cameras.values(), cell.planes.values()
+    frames = beam_frames(cell).values()
+    return State(
+        np.array([c.T_base_camera[:3, :3] for c in cameras]),
+        np.array([c.T_base_camera[:3, 3] for c in cameras]),
+        np.array([c.intrinsics.vector for c in cameras]),
+        np.array([f.R for f in frames]),
+        np.array([f.t for f in frames]),
+        np.zeros((len(frames), 4)),
+        np.array([p.normal_base for p in planes]),
+        np.array([p.distance for p in planes]),
+    )
+
+
+def cell_from_state(state: State, template: Cell) -> Cell:
     """Plain arrays back to a `Cell`; names and image sizes from ``template``."""
     cameras = {
         name: Camera(
@@ -158,7 +169,8 @@ def cell_from_state(state: State, template: Cell, frames: tuple[BeamFrame, ...])
         for i, (name, camera) in enumerate(template.cameras.items())
     }
     lasers = {
-        name: Beam(*frames[i].line(state.beam_l[i])) for i, name in enumerate(template.lasers)
+        name: Beam(*BeamFrame(state.beam_R[i], state.beam_t[i]).line(state.beam_l[i]))
+        for i, name in enumerate(template.lasers)
     }
     planes = {
         name: Plane(state.plane_n[i], state.plane_d[i]) for i, name in enumerate(template.planes)
@@ -166,8 +178,12 @@ def cell_from_state(state: State, template: Cell, frames: tuple[BeamFrame, ...])
     return Cell(cameras, lasers, planes)
 
 
-def _frames(cell: Cell) -> tuple[BeamFrame, ...]:
-    return tuple(BeamFrame.from_line(b.direction_hand, b.point_hand) for b in cell.lasers.values())
+def beam_frames(cell: Cell) -> dict[str, BeamFrame]:
+    """The constant frame of each beam in a chart about ``cell``."""
+    return {
+        name: BeamFrame.from_line(beam.direction_hand, beam.point_hand)
+        for name, beam in cell.lasers.items()
+    }
 
 
 def _ordered(cell: Cell, observations: Observations) -> Cell:
@@ -190,17 +206,16 @@ def _ordered(cell: Cell, observations: Observations) -> Cell:
     return Cell(*parts)
 
 
-def _prior_factor(
-    keys: CellKeys, holds: Holds, template: Cell, charts: dict[str, BeamChart]
-) -> gtsam.CustomFactor:
+def _prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFactor:
     """All priors as one factor: (row of the table - mean) / sigma; ``aspect`` by its logarithm."""
-    rows = report_map.row_names(template, charts)
+    charts = {name: BeamChart.of(beam) for name, beam in start.lasers.items()}
+    rows = report_map.row_names(start, charts)
     index = {name: i for i, (name, _) in enumerate(rows)}
-    prefix = "{}." if len(template.cameras) > 1 else ""
-    aspects = {f"{prefix.format(c)}aspect": i for i, c in enumerate(template.cameras)}
-    frames = dict(zip(template.lasers, keys.frames, strict=True))
-    columns = keys.columns
-    focal = [columns[2 * c + 1].start for c in range(len(template.cameras))]
+    prefix = "{}." if len(start.cameras) > 1 else ""
+    aspects = {f"{prefix.format(c)}aspect": i for i, c in enumerate(start.cameras)}
+    frames = beam_frames(start)
+    first_plane = chart.n - len(report_map.PLANE_TANGENT) * len(start.planes)
+    focal = len(CAMERA_TANGENT) * np.arange(len(start.cameras)) + CAMERA_TANGENT.index("fu")
 
     def residual(cell: Cell) -> Array:
         values = report_map.row_values(cell, charts)
@@ -218,31 +233,33 @@ def _prior_factor(
         return e
 
     def error(values: Any) -> Array:
-        return residual(cell_from_state(keys.read(values), template, keys.frames))
+        return residual(cell_from_state(chart.state(values.atVector(CELL_KEY)), start))
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
-        state = keys.read(values)
-        cell = cell_from_state(state, template, keys.frames)
+        z = values.atVector(CELL_KEY)
+        state = chart.state(z)
+        cell = cell_from_state(state, start)
         F = report_map.row_jacobian(cell, charts, frames)
-        for i, c in enumerate(columns[len(columns) - len(keys.planes) :]):
-            # at GTSAM's normal, whichever way it points, and its offset -d
-            F[c, c] = report_map.plane_jacobian(state.plane_n[i], state.plane_d[i])
-            F[c, c.stop - 1] *= -1.0
-        J = np.zeros((len(holds.priors), keys.n))
+        for i in range(len(start.planes)):
+            # at the normal as it stands: `Plane` turns it round where the distance is negative
+            block = slice(first_plane + 3 * i, first_plane + 3 * i + 3)
+            F[block, block] = report_map.plane_jacobian(state.plane_n[i], state.plane_d[i])
+        J = np.zeros((len(holds.priors), chart.n))
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
             if name in aspects:
-                camera = aspects[name]
-                fu, fv = state.cam_K[camera, :2]
-                J[r, focal[camera] : focal[camera] + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
+                at = focal[aspects[name]]
+                fu, fv = state.cam_K[aspects[name], :2]
+                J[r, at : at + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
             else:
                 J[r] = F[index[name]] / sigma
+        J = J @ chart.tangent_map(z)
         held = holds.held.copy()
-        for first, aspect in zip(focal, keys.aspects, strict=True):
+        for at, aspect in zip(focal, chart.aspects, strict=True):
             if aspect is not None:
-                J[:, first + 1] += aspect * J[:, first]
-                held[first] = True
+                J[:, at + 1] += aspect * J[:, at]
+                held[at] = True
         J[:, held] = 0.0
-        return residual(cell), [J[:, c] for c in columns]
+        return residual(cell), [J]
 
     noise = gtsam.noiseModel.Unit.Create(len(holds.priors))
-    return custom_factor("priors", noise, keys.keys, keys.dims, error, linearize)
+    return custom_factor("priors", noise, [CELL_KEY], [chart.n], error, linearize)

@@ -9,7 +9,7 @@ covariance ``S`` at the corrected pose. Whitening alone, at the commanded pose, 
 from __future__ import annotations
 
 import numpy as np
-from lasercal_factors.spot import SpotBatch
+from lasercal_factors.batch import SpotBatch
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array

@@ -6,7 +6,7 @@ Everything here is words and booleans over the tangent coordinates of `report_ma
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,8 @@ class Holds:
     ----------
     held : (n,) booleans over the tangent coordinates: kept at the start's value
     known : camera -> intrinsic name -> value that replaces the start's
-    aspect : camera -> fu / fv, where tied
+    aspect : camera -> fu / fv, where tied (``fu`` follows ``fv``)
+    fu_leads : cameras where ``fu`` is held, so that the tied ``fv`` is held at ``fu / aspect``
     priors : name -> (mean, sigma) in table units; names prefixed as in the table
     words : one sentence for each, for the report
     """
@@ -45,6 +46,7 @@ class Holds:
     held: npt.NDArray[np.bool_]
     known: dict[str, dict[str, float]]
     aspect: dict[str, float]
+    fu_leads: frozenset[str]
     priors: dict[str, tuple[float, float]]
     words: tuple[str, ...]
 
@@ -56,9 +58,9 @@ class Holds:
         for name, camera in cell.cameras.items():
             values = dict(zip(INTRINSIC_NAMES, camera.intrinsics.vector, strict=True))
             values |= self.known.get(name, {})
-            if name in self.aspect:
-                if "fu" in self.known.get(name, {}):
-                    values["fv"] = values["fu"] / self.aspect[name]
+            if name in self.fu_leads:
+                values["fv"] = values["fu"] / self.aspect[name]
+            elif name in self.aspect:
                 values["fu"] = self.aspect[name] * values["fv"]
             intrinsics = Intrinsics(**{k: float(v) for k, v in values.items()})
             cameras[name] = Camera(intrinsics, camera.T_base_camera, camera.image_size)
@@ -71,7 +73,7 @@ class Holds:
             for term in DISTORTION_NAMES:
                 if term not in keep:
                     held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(term)] = True
-        return Holds(held, self.known, self.aspect, self.priors, self.words)
+        return replace(self, held=held)
 
 
 def resolve_holds(
@@ -86,17 +88,26 @@ def resolve_holds(
     Raises
     ------
     DataError
-        A name in ``known``, ``fixed``, ``priors`` or ``distortion`` does not exist; lists them.
+        A name in ``known``, ``fixed`` or ``priors`` does not exist (lists those that do); something
+        is fixed at a start that was not given; two wishes contradict each other.
     """
     builder = _Builder(observations)
     builder.distortion(options.distortion)
     for key, value in options.known.items():
         builder.known_value(key, value)
     for key in options.fixed:
-        builder.fix(key)
+        builder.fix(key, initial is not None)
+    fu_leads = builder.tied_focal_lengths()
     builder.one_plane(options, initial)
     builder.user_priors(options.priors)
-    return Holds(builder.held, builder.known, builder.aspect, builder.priors, tuple(builder.words))
+    return Holds(
+        builder.held,
+        builder.known,
+        builder.aspect,
+        fu_leads,
+        builder.priors,
+        tuple(builder.words),
+    )
 
 
 class _Builder:
@@ -153,8 +164,13 @@ class _Builder:
                     self.hold(camera, term)
         self.words.append(f"{key} held at the known value {value}")
 
-    def fix(self, key: str) -> None:
+    def is_held(self, camera: str, name: str) -> bool:
+        first = self.cameras.index(camera) * len(CAMERA_TANGENT)
+        return bool(self.held[first + CAMERA_TANGENT.index(name)])
+
+    def fix(self, key: str, started: bool) -> None:
         kind, colon, name = key.partition(":")
+        names: tuple[str, ...] = ()
         if colon:
             groups = {"camera": self.cameras, "laser": self.lasers, "plane": self.planes}
             if kind not in groups or name not in groups[kind]:
@@ -187,7 +203,31 @@ class _Builder:
                 )
             for camera in cameras:
                 self.hold(camera, *names)
+        # without a given start the distortion starts at zero; all else at a crude estimate
+        if not started and not (names and set(names) <= set(DISTORTION_NAMES)):
+            raise DataError(
+                f"options.fixed: {key!r} is to be held at the start's value, but no start is "
+                "given; give one (initial), or the value itself (options.known)"
+            )
         self.words.append(f"{key} held at the start's value (fixed)")
+
+    def tied_focal_lengths(self) -> frozenset[str]:
+        """Hold both focal lengths where one is held and they are tied; cameras where fu leads."""
+        leads: list[str] = []
+        for camera, aspect in self.aspect.items():
+            fu, fv = (self.is_held(camera, name) for name in ("fu", "fv"))
+            values = [self.known[camera].get(name, np.nan) for name in ("fu", "fv")]
+            if fu and fv and not np.isclose(values[0], aspect * values[1]):
+                raise DataError(
+                    f"options.known: camera {camera!r} has its aspect tied to {aspect:g}, and fu "
+                    "and fv are both held; leave one of the three out"
+                )
+            if fu:
+                self.hold(camera, "fv")
+                leads.append(camera)
+            elif fv:
+                self.hold(camera, "fu")
+        return frozenset(leads)
 
     def one_plane(self, options: CalibrationOptions, initial: Cell | None) -> None:
         """Assumptions of the paper's section 3.3 for every camera that sees one plane only."""
@@ -203,7 +243,8 @@ class _Builder:
             if initial is not None and camera in initial.cameras:
                 values = {t: getattr(initial.cameras[camera].intrinsics, t) for t in values}
             for term, value in values.items():
-                if free[term]:
+                row = self.prefix(camera) + {"skew": "alpha_c"}.get(term, term)
+                if free[term] and row not in options.priors:
                     self.known[camera][term] = value
                     self.hold(camera, term)
                     fixed.append(f"{term} = {value:g}")
@@ -238,13 +279,34 @@ class _Builder:
                     f"options.priors[{name!r}]: expected (mean, sigma), got {pair!r}"
                 ) from None
             if not (np.isfinite(mean) and 0 < sigma < np.inf):
-                raise DataError(f"options.priors[{name!r}]: sigma must be positive, got {sigma}")
+                raise DataError(
+                    f"options.priors[{name!r}]: expected a finite mean and a sigma > 0, got "
+                    f"{pair!r}"
+                )
+            self.refuse_held(name, mean)
             self.priors[name] = (mean, sigma)
             self.words.append(f"prior {name} = {mean:g} +- {sigma:g}")
 
+    def refuse_held(self, key: str, mean: float) -> None:
+        """A prior on what is held would say nothing: one of the two is a mistake."""
+        camera, dot, name = key.rpartition(".")
+        if (not dot and len(self.cameras) > 1) or (dot and camera not in self.cameras):
+            return  # no camera's row; unknown names are refused by `check_prior_names`
+        camera = camera or self.cameras[0]
+        row = {"alpha_c": "skew", "aspect": "fu"}.get(name, name)
+        if name == "aspect" and not mean > 0:
+            raise DataError(f"options.priors[{key!r}]: the mean must be positive, got {mean:g}")
+        tied = name == "aspect" and camera in self.aspect
+        if tied or (row in CAMERA_TANGENT and self.is_held(camera, row)):
+            raise DataError(
+                f"options.priors[{key!r}]: {name} is held (known, fixed, tied, or left out of the "
+                "distortion), so that a prior on it has no meaning; leave one of the two out"
+            )
 
-def check_prior_names(holds: Holds, cell: Cell, charts: dict[str, BeamChart]) -> None:
+
+def check_prior_names(holds: Holds, cell: Cell) -> None:
     """Raise `DataError` where a prior names no row of the table."""
+    charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
     rows = [name for name, _ in table_rows(cell, charts)]
     rows += [f"{c}.aspect" for c in cell.cameras] if len(cell.cameras) > 1 else ["aspect"]
     for name in holds.priors:
@@ -256,14 +318,16 @@ def _known_terms(name: str, value: Any) -> dict[str, float]:
     try:
         if name == "principal_point":
             u0, v0 = value
-            return {"u0": float(u0), "v0": float(v0)}
+            return _known_terms("u0", u0) | _known_terms("v0", v0)
         if name in ("aspect", *INTRINSIC_NAMES):
             number = float(value)
             if name in ("aspect", "fu", "fv") and not number > 0:
                 raise DataError(f"options.known: {name} must be positive, got {value!r}")
+            if not np.isfinite(number):
+                raise ValueError
             return {name: number}
     except (TypeError, ValueError):
-        wanted = "(u0, v0)" if name == "principal_point" else "a number"
+        wanted = "(u0, v0)" if name == "principal_point" else "a finite number"
         raise DataError(f"options.known: {name} must be {wanted}, got {value!r}") from None
     raise DataError(
         f"options.known: unknown name {name!r}; allowed: principal_point, aspect, "

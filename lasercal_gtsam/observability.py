@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from lasercal_gtsam.calibration import WeakDirection
 from lasercal_gtsam.frozen import Array
@@ -51,7 +52,9 @@ class RangeSvd:
     labels: tuple[str, ...]
 
     @classmethod
-    def of(cls, R: Array, labels: tuple[str, ...], free: Array) -> RangeSvd:
+    def of(
+        cls, R: Array, labels: tuple[str, ...], free: npt.NDArray[np.bool_]
+    ) -> RangeSvd:
         """Decompose ``R`` (rows, n), information in sigmas, over the ``free`` (n,) columns."""
         names = tuple(label for label, is_free in zip(labels, free, strict=True) if is_free)
         ranges = plausible_ranges(names)

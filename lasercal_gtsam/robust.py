@@ -10,9 +10,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from lasercal_factors.spot import Loss
+from lasercal_factors.batch import Loss
 
 from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import state_from_cell
 from lasercal_gtsam.solve import Solution
 from lasercal_gtsam.start import Search
 
@@ -93,7 +94,6 @@ def reject_outliers(
 
 
 def _lengths(search: Search, solution: Solution, unknowns: int) -> tuple[Array, float]:
-    problem = solution.problem
-    lengths = search.batch.whitened_lengths(problem.keys.read(problem.values(solution.cell)))
+    lengths = search.batch.whitened_lengths(state_from_cell(solution.cell))
     lengths = np.where(np.isnan(lengths), np.inf, lengths)
     return lengths, robust_scale(lengths, unknowns)

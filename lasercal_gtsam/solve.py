@@ -10,7 +10,7 @@ import numpy as np
 from lasercal_gtsam.cell import Cell, Intrinsics
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph
+from lasercal_gtsam.graph import CellGraph, state_from_cell
 from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.report_map import tangent_labels
 
@@ -65,7 +65,7 @@ def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True
     SolveError
         The start itself is impossible (a beam misses its plane, a spot behind the camera, ...).
     """
-    values = problem.values()
+    values = problem.start_values()
     if not np.isfinite(problem.graph.error(values)):
         raise SolveError(
             "the start is impossible: " + (_impossible(problem, problem.start) or "not finite")
@@ -83,8 +83,7 @@ def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True
             break
         problem = problem.rescaled(scale)
     cell = problem.cell(values)
-    state = problem.keys.read(values)
-    cost = problem.batch.total_loss(state, problem.loss)
+    cost = problem.batch.total_loss(problem.state(values), problem.loss)
     total = 2.0 * float(problem.graph.error(values))
     troubles = _troubles(problem, cell, cost, iterations, decrement, max_iterations)
     return Solution(problem, cell, cost, total, iterations, decrement, troubles)
@@ -92,45 +91,17 @@ def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True
 
 def degrees_of_freedom(problem: CellGraph, values: gtsam.Values) -> float:
     """Residuals minus the unknowns that the data (not the priors) determine."""
-    rows = 2.0 * float(problem.batch.used.sum())
-    free = int(free_columns(problem).sum())
+    rows = 2.0 * len(problem.batch.order)
     if not problem.holds.priors:
-        return rows - free
-    A = problem.graph.linearize(values).jacobian(natural_order(problem))[0]
-    A = A[:, free_columns(problem)]
-    m = len(problem.holds.priors)
-    data = A[: len(A) - m]
-    information = A.T @ A
-    share = np.trace(np.linalg.lstsq(information, data.T @ data, rcond=None)[0])
-    return rows - float(share)
-
-
-def free_columns(problem: CellGraph) -> Array:
-    """(n,) booleans: tangent coordinates that are estimated (tied focal lengths: ``fv`` is)."""
-    free = ~problem.holds.held
-    for c, aspect in enumerate(problem.keys.aspects):
-        if aspect is not None:
-            free[problem.keys.columns[2 * c + 1].start] = False
-    return np.asarray(free)
-
-
-def natural_order(problem: CellGraph) -> gtsam.Ordering:
-    """Elimination order in the column order of the keys."""
-    ordering = gtsam.Ordering()
-    for key in problem.keys.keys:
-        ordering.push_back(key)
-    return ordering
-
-
-def square_root_information(problem: CellGraph, values: gtsam.Values) -> Array:
-    """Rows of the whole graph (spots and priors) at the values, columns in key order, (m, n)."""
-    return np.asarray(problem.graph.linearize(values).jacobian(natural_order(problem))[0])
+        return rows - float(problem.free.sum())
+    A = problem.rows(values)[:, problem.free]
+    data = A[: len(A) - len(problem.holds.priors)]
+    return rows - float(np.trace(np.linalg.lstsq(A.T @ A, data.T @ data, rcond=None)[0]))
 
 
 def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> RangeSvd:
     """Decompose the information; `DegenerateError` names directions that are not determined."""
-    R = square_root_information(problem, values)
-    svd = RangeSvd.of(R, tangent_labels(problem.start), free_columns(problem))
+    svd = RangeSvd.of(problem.rows(values), tangent_labels(problem.start), problem.free)
     weak = svd.weak_directions(SINGULAR)
     if weak:
         raise DegenerateError(
@@ -147,7 +118,6 @@ def _optimise(
 ) -> tuple[gtsam.Values, int]:
     params = gtsam.LevenbergMarquardtParams()
     params.setMaxIterations(max_iterations)
-    params.setOrdering(natural_order(problem))
     params.setRelativeErrorTol(1e-10)
     params.setAbsoluteErrorTol(1e-18)
     optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, values, params)
@@ -181,7 +151,7 @@ def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, flo
 
 
 def _data_scale(problem: CellGraph, values: gtsam.Values) -> float:
-    cost = problem.batch.total_loss(problem.keys.read(values), problem.loss)
+    cost = problem.batch.total_loss(problem.state(values), problem.loss)
     return float(np.sqrt(cost / max(degrees_of_freedom(problem, values), 1.0)))
 
 
@@ -213,7 +183,8 @@ def _troubles(
 
 def _impossible(problem: CellGraph, cell: Cell) -> str | None:
     try:
-        bad = np.isnan(problem.residuals(cell)[:, 0]) & problem.batch.used
+        residuals = problem.batch.residuals(state_from_cell(cell))
+        bad = np.isnan(residuals[:, 0]) & problem.batch.used
     except LasercalError as error:
         return str(error)
     if not bad.any():

@@ -9,12 +9,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from lasercal_factors.spot import Loss, SpotBatch
+from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.cell import Camera, Cell, Intrinsics
 from lasercal_gtsam.errors import DataError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph, make_graph
+from lasercal_gtsam.graph import CellGraph, make_graph, state_from_cell
 from lasercal_gtsam.holds import Holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import DISTORTION_NAMES, CalibrationOptions
@@ -22,9 +22,7 @@ from lasercal_gtsam.report_map import CAMERA_TANGENT
 from lasercal_gtsam.solve import (
     Solution,
     fold_warnings,
-    free_columns,
     solve,
-    square_root_information,
 )
 
 # method 6.3: how many candidates are refined shortly, and how many different ones fully
@@ -132,7 +130,7 @@ def best_of(solutions: Iterable[Solution]) -> Solution:
     ranked = sorted(solutions, key=lambda s: (len(s.troubles) > 0, s.cost))
     best = ranked[0]
     if fold_warnings(best.cell):
-        noise = best.cost / max(2 * best.problem.batch.used.sum() - best.problem.keys.n, 1)
+        noise = best.cost / max(2 * best.problem.batch.used.sum() - best.problem.free.sum(), 1)
         for other in ranked[1:]:
             close = other.cost <= best.cost + _FOLD_CHI2 * noise
             if close and other.plausible == best.plausible and not fold_warnings(other.cell):
@@ -171,7 +169,7 @@ def _short(search: Search, holds: Holds, cell: Cell) -> tuple[Cell, float] | Non
     """One short refinement on the spots that are possible at its start."""
     try:
         problem = make_graph(search.observations, search.batch, holds, cell, search.loss)
-        good = ~np.isnan(problem.residuals(problem.start)[:, 0])
+        good = ~np.isnan(search.batch.residuals(state_from_cell(problem.start))[:, 0])
         if good.mean() < _MIN_POSSIBLE:
             return None
         if not good.all():
@@ -247,9 +245,9 @@ def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
 def _quick_sigma(solution: Solution, column: int) -> float:
     """Marginal sigma of one tangent coordinate; infinite where it is undetermined."""
     problem = solution.problem
-    R = square_root_information(problem, problem.values(solution.cell))
-    free = free_columns(problem)
-    unit = np.zeros(problem.keys.n)
+    problem = problem.anchored(solution.cell)
+    R, free = problem.rows(problem.start_values()), problem.free
+    unit = np.zeros(problem.chart.n)
     unit[column] = 1.0
     x, _, rank, _ = np.linalg.lstsq(R[:, free].T @ R[:, free], unit[free], rcond=None)
     scale = (

@@ -13,8 +13,9 @@ import numpy as np
 from lasercal_gtsam.calibration import Parameter, WeakDirection
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph
+from lasercal_gtsam.graph import CellGraph, beam_frames
 from lasercal_gtsam.report_map import (
+    CAMERA_TANGENT,
     BeamChart,
     row_jacobian,
     row_names,
@@ -24,7 +25,6 @@ from lasercal_gtsam.report_map import (
 from lasercal_gtsam.solve import (
     Solution,
     degrees_of_freedom,
-    free_columns,
     refuse_if_singular,
 )
 
@@ -64,25 +64,21 @@ def estimate_uncertainty(solution: Solution) -> Uncertainty:
         The information is singular; the message names the undetermined directions.
     """
     problem = solution.problem.anchored(solution.cell)
-    values = problem.values()
+    values = problem.start_values()
     svd = refuse_if_singular(problem, values)
     dof = degrees_of_freedom(problem, values)
     sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
     unit = sigma0 / problem.scale
-    E = _expansion(problem, free_columns(problem))
+    E = _expansion(problem)
     covariance = unit**2 * (E @ svd.covariance() @ E.T)
     weak = svd.weak_directions(sigma=unit if unit > _EXACT else 1.0)
     return Uncertainty(covariance, tangent_labels(solution.cell), sigma0, dof, weak)
 
 
-def table_parameters(
-    cell: Cell, initial: Cell, uncertainty: Uncertainty, problem: CellGraph
-) -> tuple[Parameter, ...]:
+def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tuple[Parameter, ...]:
     """Rows of the paper's Table 2 with sigmas by exact change of variables."""
     charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
-    anchored = problem.anchored(cell)
-    frames = dict(zip(cell.lasers, anchored.keys.frames, strict=True))
-    F = row_jacobian(cell, charts, frames)
+    F = row_jacobian(cell, charts, beam_frames(cell))
     variances = np.einsum("ij,jk,ik->i", F, uncertainty.covariance, F, optimize=True)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     rows = zip(
@@ -98,14 +94,11 @@ def table_parameters(
     )
 
 
-def _expansion(problem: CellGraph, free: Array) -> Array:
-    """(n, n_free): free coordinates of the graph to tangent coordinates of the report."""
-    n = problem.keys.n
-    E = np.eye(n)
-    for c, aspect in enumerate(problem.keys.aspects):
+def _expansion(problem: CellGraph) -> Array:
+    """(n, n_free): free coordinates to all of them; tied focal lengths move together."""
+    E = np.eye(problem.chart.n)
+    for c, aspect in enumerate(problem.chart.aspects):
         if aspect is not None:
-            first = problem.keys.columns[2 * c + 1].start
-            E[first, first + 1] = aspect
-    for columns in problem.keys.columns[len(problem.keys.columns) - len(problem.keys.planes) :]:
-        E[columns.stop - 1] *= -1.0  # GTSAM's plane offset is minus our distance
-    return E[:, free]
+            fu = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("fu")
+            E[fu, fu + 1] = aspect
+    return E[:, problem.free]

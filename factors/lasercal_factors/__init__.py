@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 _EXPORTS = {
     "BeamFrame": "beam",
+    "CellChart": "chart",
     "CellKeys": "spot",
     "FactorError": "errors",
+    "LaserCellFactor": "chart",
     "LaserSpotBatchFactor": "spot",
     "LaserSpotFactor": "spot",
     "LasercalError": "errors",
-    "Loss": "spot",
-    "SpotBatch": "spot",
+    "Loss": "batch",
+    "SpotBatch": "batch",
+    "State": "batch",
     "check_jacobians": "checks",
     "custom_factor": "wrap",
     "keys_for": "spot",
@@ -24,28 +27,31 @@ _EXPORTS = {
 
 __all__ = [
     "BeamFrame",
+    "CellChart",
     "CellKeys",
     "FactorError",
+    "LaserCellFactor",
     "LaserSpotBatchFactor",
     "LaserSpotFactor",
     "LasercalError",
     "Loss",
     "SpotBatch",
+    "State",
     "check_jacobians",
     "custom_factor",
     "keys_for",
 ]
 
 if TYPE_CHECKING:
+    from lasercal_factors.batch import Loss, SpotBatch, State
     from lasercal_factors.beam import BeamFrame
+    from lasercal_factors.chart import CellChart, LaserCellFactor
     from lasercal_factors.checks import check_jacobians
     from lasercal_factors.errors import FactorError, LasercalError
     from lasercal_factors.spot import (
         CellKeys,
         LaserSpotBatchFactor,
         LaserSpotFactor,
-        Loss,
-        SpotBatch,
         keys_for,
     )
     from lasercal_factors.wrap import custom_factor

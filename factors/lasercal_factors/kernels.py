@@ -38,12 +38,12 @@ _PADDED, _PANEL = 24, 32
 
 # sums may be reordered (vector units); infinities and NaN keep their meaning
 _FAST = {"reassoc", "nsz", "contract"}
-_jit = njit(cache=True, nogil=True, error_model="numpy")
+jit = njit(cache=True, nogil=True, error_model="numpy")
 _jit_fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
 _inline = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
 
 
-@_jit
+@jit
 def loss_value(kind, c, m):
     """Robust loss of the squared whitened residual length ``m``; equals ``m`` for small ``m``."""
     if kind == LOSS_HUBER:
@@ -55,7 +55,7 @@ def loss_value(kind, c, m):
     return m
 
 
-@_jit
+@jit
 def loss_weight(kind, c, m):
     """Derivative of `loss_value`: the weight of the spot."""
     if kind == LOSS_HUBER:
@@ -68,7 +68,7 @@ def loss_weight(kind, c, m):
     return 1.0
 
 
-@_jit
+@jit
 def _beam_in_hand(R, t, l):  # noqa: E741
     """Direction (not normalised) and point of a beam in hand coordinates."""
     u = np.empty(3)
@@ -79,7 +79,7 @@ def _beam_in_hand(R, t, l):  # noqa: E741
     return u, q
 
 
-@_jit
+@jit
 def tangent_basis(n):
     """(3, 2) basis across the unit vector ``n``, the same as `gtsam.Unit3.basis`."""
     a0, a1, a2 = abs(n[0]), abs(n[1]), abs(n[2])
@@ -327,7 +327,7 @@ def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):
                 out[base + i, 1, j] = Q[j, _PANEL + i]
 
 
-@_jit
+@jit
 def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
     """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
     out = np.empty((pixels.shape[1], 2))
@@ -355,7 +355,7 @@ def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l
     return out
 
 
-@_jit
+@jit
 def total_loss(
     pixels,
     hands,
@@ -399,7 +399,7 @@ def total_loss(
     return total if bad == 0.0 and math.isfinite(total) else np.inf
 
 
-@_jit
+@jit
 def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
     """Whitened Jacobian and residual of every spot, (N, 2, 23), possible or not."""
     out = np.empty((pixels.shape[1], 2, COLUMNS))
@@ -425,7 +425,7 @@ def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, pla
     return out
 
 
-@_jit
+@jit
 def information(
     pixels,
     hands,
@@ -443,7 +443,7 @@ def information(
     kind,
     c_loss,
 ):
-    """Augmented information ``[J r]^T [J r]``, (n+1, n+1), upper triangle; [0, 0] NaN if not ok.
+    """Augmented information ``[J r]^T [J r]``, (n+1, n+1); [0, 0] NaN if a spot cannot be.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
     """
@@ -484,45 +484,33 @@ def information(
         column[COLUMNS - 1] = n
         for i in range(COLUMNS):
             for j in range(i, COLUMNS):
-                a, b = min(column[i], column[j]), max(column[i], column[j])
-                H[a, b] += S[i, j]
+                H[column[i], column[j]] += S[i, j]
+                if i != j:
+                    H[column[j], column[i]] += S[i, j]
     if bad != 0.0:
         H[0, 0] = np.nan
     return H
 
 
-@_jit
+@jit
 def constrain(H, held, tie_from, tie_to, tie_ratio):
-    """Apply ties and held columns to an augmented information in place (upper triangle).
+    """Apply ties and held columns to an augmented information in place.
 
     A tie makes the unknown ``from`` move as ``ratio`` times ``to``: its column is added to that of
     ``to``. Held (and tied) columns are cleared and get a unit pin on the diagonal, so that they do
     not move and the rest is as if they were not there.
     """
-    size = len(H)
     for t in range(len(tie_from)):
-        f, g, a = tie_from[t], tie_to[t], tie_ratio[t]
-        ff = H[f, f]
-        fg = H[f, g] if f < g else H[g, f]
-        for j in range(size):
-            if j != g:
-                v = a * (H[f, j] if f <= j else H[j, f])
-                if g < j:
-                    H[g, j] += v
-                else:
-                    H[j, g] += v
-        H[g, g] += 2.0 * a * fg + a * a * ff
-    for i in range(size - 1):
+        H[:, tie_to[t]] += tie_ratio[t] * H[:, tie_from[t]]
+        H[tie_to[t], :] += tie_ratio[t] * H[tie_from[t], :]
+    for i in range(len(H) - 1):
         if held[i]:
-            for j in range(size):
-                if i <= j:
-                    H[i, j] = 0.0
-                else:
-                    H[j, i] = 0.0
+            H[i, :] = 0.0
+            H[:, i] = 0.0
             H[i, i] = 1.0
 
 
-@_jit
+@jit
 def cholesky(H):
     """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1); zero rows for null pivots."""
     size = len(H)
@@ -543,7 +531,7 @@ def cholesky(H):
     return np.ascontiguousarray(Rt.T)
 
 
-@_jit
+@jit
 def square_root_information(
     pixels,
     hands,

@@ -196,32 +196,6 @@ def test_covariance_beside_held_parameters_is_that_of_the_smaller_problem() -> N
     )  # fmt: skip
 
 
-def test_tied_focal_lengths_move_together() -> None:
-    scene = Scene(count=60)
-    tied = keys_for(1, 1, 2, [scene.frame], [1.25])
-    factor = LaserSpotBatchFactor(tied, scene.batch)
-    # fu is read as 1.25 fv whatever is stored
-    values = scene.values_of(scene.cell, tied)
-    k = tied.cameras[0][1]
-    fv = values.atCal3DS2(k).fy()
-    free = LaserSpotBatchFactor(scene.keys, scene.batch)
-    moved = gtsam.Values(values)
-    vector = values.atCal3DS2(k).vector()
-    moved.update(k, gtsam.Cal3DS2(1.25 * fv, *vector[1:]))
-    assert factor.error(values) == pytest.approx(free.error(moved), rel=1e-12)
-    linear, full = factor.linearize(values), free.linearize(moved)
-    A, b = full.jacobian()
-    gradient = A.T @ b
-    At, bt = linear.jacobian()
-    tied_gradient = At.T @ bt
-    order = list(full.keys())
-    first = sum(tied.dims[tied.keys.index(key)] for key in order[: order.index(k)])
-    assert tied_gradient[first] == 0
-    assert tied_gradient[first + 1] == pytest.approx(
-        gradient[first + 1] + 1.25 * gradient[first], rel=1e-9
-    )
-
-
 @pytest.mark.parametrize("name", ["huber", "cauchy", "geman-mcclure"])
 def test_robust_batch_equals_gtsams_robust_single_factors(name: str) -> None:
     scene = Scene(count=40)
@@ -283,7 +257,7 @@ def test_impossible_spots_cost_infinity_and_cannot_be_linearised(scene: Scene) -
     assert scene.single(0).error(values) == np.inf
     with pytest.raises(FactorError, match="behind its camera"):
         factor.linearize(values)
-    with pytest.raises(FactorError, match="not finite"):
+    with pytest.raises(FactorError, match="behind its camera"):
         scene.single(0).linearize(values)
 
 

@@ -1,0 +1,197 @@
+"""Spots of a cell as plain arrays for the kernels, and the state they are predicted from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from lasercal_factors import kernels
+from lasercal_factors.errors import FactorError
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+LossName = Literal["none", "huber", "cauchy", "geman-mcclure"]
+IMPOSSIBLE = (
+    "linearised where a beam misses its plane, a spot lies behind its camera, or the distortion "
+    "folds; check the start value"
+)
+LOSSES: dict[str, int] = {"none": 0, "huber": 1, "cauchy": 2, "geman-mcclure": 3}
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Robust loss on the whitened length of a spot's residual; ``threshold`` in sigmas."""
+
+    name: LossName = "none"
+    threshold: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.name not in LOSSES or not self.threshold > 0:
+            raise FactorError(f"loss: one of {', '.join(LOSSES)}, threshold > 0; got {self}")
+
+
+class State(NamedTuple):
+    """Values of a cell's variables as plain arrays (see `kernels`)."""
+
+    cam_R: Array
+    cam_t: Array
+    cam_K: Array
+    beam_R: Array
+    beam_t: Array
+    beam_l: Array
+    plane_n: Array
+    plane_d: Array
+
+
+@dataclass(frozen=True, eq=False)
+class SpotBatch:
+    """Spots sorted into blocks of equal camera, laser and plane; build it with `from_arrays`.
+
+    Attributes
+    ----------
+    pixels, hands, blocks : see `kernels`; spots along the last axis
+    order : (N,) input index of each spot held
+    size : number of spots given (some may have been left out by `weighted`)
+    """
+
+    pixels: Array
+    hands: Array
+    blocks: Index
+    order: Index
+    size: int
+
+    @classmethod
+    def from_arrays(
+        cls,
+        uv: npt.ArrayLike,
+        cov_uv: npt.ArrayLike,
+        T_base_hand: npt.ArrayLike,
+        camera: npt.ArrayLike,
+        laser: npt.ArrayLike,
+        plane: npt.ArrayLike,
+    ) -> SpotBatch:
+        """Sort and whiten.
+
+        Parameters
+        ----------
+        uv : (N, 2) px
+        cov_uv : (N, 2, 2) px^2, positive definite
+        T_base_hand : (N, 4, 4), metres
+        camera, laser, plane : (N,) indices into the keys of `CellKeys`
+
+        Raises
+        ------
+        FactorError
+            On shapes that do not fit, no spots, or a covariance that is not positive definite.
+        """
+        uv, T = np.asarray(uv, dtype=np.float64), np.asarray(T_base_hand, dtype=np.float64)
+        count = len(uv)
+        who = np.column_stack([np.asarray(x, dtype=np.int64) for x in (camera, laser, plane)])
+        if not count or uv.shape != (count, 2) or T.shape != (count, 4, 4) or len(who) != count:
+            raise FactorError(
+                f"spots: uv {uv.shape}, T_base_hand {T.shape}, {len(who)} indices; expected "
+                "(N, 2), (N, 4, 4) and N with N > 0"
+            )
+        order = np.lexsort((who[:, 2], who[:, 1], who[:, 0]))
+        whitening = whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64))
+        pixels = np.concatenate([uv, whitening], axis=1)[order].T
+        hands = np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)[order].T
+        return cls(
+            np.ascontiguousarray(pixels),
+            np.ascontiguousarray(hands),
+            _blocks(who[order]),
+            order,
+            count,
+        )
+
+    def __len__(self) -> int:
+        return self.size
+
+    def weighted(self, weights: npt.ArrayLike) -> SpotBatch:
+        """Multiply the information of each spot by a weight (N,), input order.
+
+        Spots of weight zero are left out altogether, even if no spot can be where they are.
+        """
+        given = np.asarray(weights, dtype=np.float64)
+        if given.shape != (self.size,) or not np.all(given >= 0):
+            raise FactorError(f"weights: expected ({self.size},) numbers >= 0, got {given.shape}")
+        weight = given[self.order]
+        keep = weight > 0
+        if not keep.any():
+            raise FactorError("weights: every spot has weight zero")
+        who = np.repeat(self.blocks[:, :3], self.blocks[:, 4] - self.blocks[:, 3], axis=0)
+        pixels = self.pixels[:, keep].copy()
+        pixels[2:] *= np.sqrt(weight[keep])
+        hands = np.ascontiguousarray(self.hands[:, keep])
+        return SpotBatch(pixels, hands, _blocks(who[keep]), self.order[keep], self.size)
+
+    def scaled(self, scale: float) -> SpotBatch:
+        """The same spots with every pixel sigma multiplied by ``scale``."""
+        pixels = self.pixels.copy()
+        pixels[2:] /= scale
+        return SpotBatch(pixels, self.hands, self.blocks, self.order, self.size)
+
+    @cached_property
+    def used(self) -> npt.NDArray[np.bool_]:
+        """(N,) booleans in input order: spots that are not left out."""
+        out = np.zeros(self.size, dtype=np.bool_)
+        out[self.order] = True
+        return out
+
+    def residuals(self, state: State) -> Array:
+        """Predicted minus seen pixel in input order, (N, 2); NaN where impossible or left out."""
+        out = np.full((self.size, 2), np.nan)
+        out[self.order] = kernels.residuals(self.pixels, self.hands, self.blocks, *state)
+        return out
+
+    def whitened_lengths(self, state: State) -> Array:
+        """Length of each whitened residual (sigmas), input order, (N,); NaN as in `residuals`."""
+        du, dv = kernels.residuals(self.pixels, self.hands, self.blocks, *state).T
+        w00, w01, w11 = self.pixels[2:]
+        out = np.full(self.size, np.nan)
+        out[self.order] = np.hypot(w00 * du + w01 * dv, w11 * dv)
+        return out
+
+    def rows(self, state: State) -> Array:
+        """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
+        out = np.full((self.size, 2, kernels.COLUMNS), np.nan)
+        out[self.order] = kernels.rows(self.pixels, self.hands, self.blocks, *state)
+        return out
+
+    def total_loss(self, state: State, loss: Loss) -> float:
+        """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
+        return float(
+            kernels.total_loss(
+                self.pixels, self.hands, self.blocks, *state, LOSSES[loss.name], loss.threshold
+            )
+        )
+
+
+def _blocks(who: Index) -> Index:
+    """Blocks of equal rows of ``who`` (N, 3), which is sorted."""
+    first = np.flatnonzero(np.append(True, np.any(who[1:] != who[:-1], axis=1)))
+    return np.column_stack([who[first], first, np.append(first[1:], len(who))])
+
+
+def whitening_from_covariance(cov: Array) -> Array:
+    """(N, 3) ``w00, w01, w11`` of upper triangular ``W`` with ``W.T W = inv(cov)``.
+
+    Raises
+    ------
+    FactorError
+        A covariance is not positive definite; names the first.
+    """
+    a, b, c = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    with np.errstate(all="ignore"):
+        det = a * c - b * b
+        w00 = np.sqrt(c / det)
+        out = np.column_stack([w00, -b / (det * w00), 1 / np.sqrt(c)])
+    bad = ~((det > 0) & (c > 0) & np.isfinite(out).all(axis=1))
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise FactorError(f"cov_uv[{k}]: not positive definite: {cov[k].tolist()}")
+    return out

@@ -1,0 +1,177 @@
+"""Compiled arithmetic of the chart: a whole cell as one vector about a reference state.
+
+Arrays as in `kernels`; the coordinates ``z`` (n,) as in `chart.CellChart`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lasercal_factors.kernels import (
+    cholesky,
+    constrain,
+    information,
+    jit,
+    tangent_basis,
+    total_loss,
+)
+
+
+@jit
+def rotation(w):
+    """Rotation matrix of the vector ``w`` and its right Jacobian."""
+    W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    W2 = np.outer(w, w)
+    t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
+    for i in range(3):
+        W2[i, i] -= t2
+    t = math.sqrt(t2)
+    if t < 1e-4:
+        a, b, c = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
+    else:
+        a, b, c = math.sin(t) / t, (1.0 - math.cos(t)) / t2, (t - math.sin(t)) / (t2 * t)
+    identity = np.eye(3)
+    return identity + a * W + b * W2, identity - b * W + c * W2
+
+
+@jit
+def move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
+    """State at chart coordinates ``z`` (n,) about a reference state.
+
+    A camera (15): ``R exp(w)``, ``t + R v``, intrinsics added; where ``aspects`` (C,) is a number,
+    ``fu`` is that times ``fv``. A beam (4): added. A plane (3): the normal tilted along
+    `tangent_basis` and normalised, the distance added.
+    """
+    R, t, K = cam_R.copy(), cam_t.copy(), cam_K.copy()
+    line, normal, distance = beam_l.copy(), plane_n.copy(), plane_d.copy()
+    at = 0
+    for c in range(len(cam_R)):
+        turn, _ = rotation(z[at : at + 3])
+        for i in range(3):
+            for j in range(3):
+                R[c, i, j] = 0.0
+                for k in range(3):
+                    R[c, i, j] += cam_R[c, i, k] * turn[k, j]
+                t[c, i] += cam_R[c, i, j] * z[at + 3 + j]
+        for j in range(9):
+            K[c, j] += z[at + 6 + j]
+        if not math.isnan(aspects[c]):
+            K[c, 0] = aspects[c] * K[c, 1]
+        at += 15
+    for m in range(len(beam_l)):
+        for j in range(4):
+            line[m, j] += z[at + j]
+        at += 4
+    for p in range(len(plane_n)):
+        B = tangent_basis(plane_n[p])
+        for i in range(3):
+            normal[p, i] += B[i, 0] * z[at] + B[i, 1] * z[at + 1]
+        normal[p] /= math.sqrt((normal[p] * normal[p]).sum())
+        distance[p] += z[at + 2]
+        at += 3
+    return R, t, K, beam_R, beam_t, line, normal, distance
+
+
+@jit
+def normal_map(n, moved_n, tilt):
+    """(2, 2): a step of `move`'s ``tilt`` (2,) to a step along the moved normal's own basis."""
+    B, moved_B = tangent_basis(n), tangent_basis(moved_n)
+    length = 1.0 / math.sqrt(1.0 + tilt[0] * tilt[0] + tilt[1] * tilt[1])
+    M = np.zeros((2, 2))
+    for i in range(2):
+        for j in range(2):
+            for k in range(3):
+                M[i, j] += moved_B[k, i] * B[k, j] * length
+    return M
+
+
+@jit
+def _change_columns(H, at, M):
+    """Replace columns and rows ``at ...`` of a symmetric ``H`` by their combinations ``M``."""
+    k = len(M)
+    old = H[:, at : at + k].copy()
+    for j in range(k):
+        H[:, at + j] = 0.0
+        for i in range(k):
+            H[:, at + j] += old[:, i] * M[i, j]
+    old = H[at : at + k, :].copy()
+    for j in range(k):
+        H[at + j, :] = 0.0
+        for i in range(k):
+            H[at + j, :] += M[i, j] * old[i, :]
+
+
+@jit
+def transport(H, z, plane_n, moved_n, cameras, lasers):
+    """Turn an information in tangent coordinates at `move`'s result into one in ``z``, in place."""
+    at = 0
+    for _ in range(cameras):
+        turn, right = rotation(z[at : at + 3])
+        _change_columns(H, at, right)
+        _change_columns(H, at + 3, turn.T)
+        at += 15
+    at += 4 * lasers
+    for p in range(len(plane_n)):
+        _change_columns(H, at, normal_map(plane_n[p], moved_n[p], z[at : at + 2]))
+        # the rows' offset is GTSAM's, -d
+        H[:, at + 2] *= -1.0
+        H[at + 2, :] *= -1.0
+        at += 3
+
+
+@jit
+def loss_at(
+    z,
+    aspects,
+    cam_R,
+    cam_t,
+    cam_K,
+    beam_R,
+    beam_t,
+    beam_l,
+    plane_n,
+    plane_d,
+    pixels,
+    hands,
+    blocks,
+    kind,
+    c_loss,
+):
+    """`total_loss` at chart coordinates ``z``."""
+    state = move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d)
+    return total_loss(pixels, hands, blocks, *state, kind, c_loss)
+
+
+@jit
+def square_root_information_at(
+    z,
+    aspects,
+    cam_R,
+    cam_t,
+    cam_K,
+    beam_R,
+    beam_t,
+    beam_l,
+    plane_n,
+    plane_d,
+    pixels,
+    hands,
+    blocks,
+    offsets,
+    kind,
+    c_loss,
+    held,
+    tie_from,
+    tie_to,
+    tie_ratio,
+):
+    """`square_root_information` in chart coordinates, at ``z``."""
+    state = move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d)
+    H = information(pixels, hands, blocks, offsets, len(z), *state, kind, c_loss)
+    if not math.isfinite(H[0, 0]):
+        return H
+    transport(H, z, plane_n, state[6], len(cam_R), len(beam_l))
+    constrain(H, held, tie_from, tie_to, tie_ratio)
+    return cholesky(H)
