@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
@@ -33,8 +34,9 @@ class CalibrationOptions:
         any intrinsic by name (``fu fv u0 v0 k1 k2 p1 p2``). With several cameras
         ``"<camera>.<name>"`` addresses one of them.
     fixed
-        Held at the start's value: any intrinsic by name, ``"intrinsics"``, ``"T_base_camera"``,
-        or whole parts ``"camera:<name>"``, ``"laser:<name>"``, ``"plane:<name>"``.
+        Held at the value of a given start: any intrinsic by name, ``"intrinsics"``,
+        ``"T_base_camera"``, or whole parts ``"camera:<name>"``, ``"laser:<name>"``,
+        ``"plane:<name>"``. Without a given start only distortion terms, at zero.
     priors
         Gaussian priors on rows of the result table: name -> (mean, sigma), in the table's units
         (px, mm, deg); ``"aspect"`` means fu / fv.
@@ -42,6 +44,12 @@ class CalibrationOptions:
         Limit of the Levenberg-Marquardt iterations of one solve.
     seed
         Seed of everything that draws numbers; the default path draws none.
+
+    Raises
+    ------
+    DataError
+        A field is not what it may be; names all of them. (Names of parameters and parts are checked
+        by `calibrate`, which knows the observations.)
     """
 
     sigma_px: float | None = None
@@ -56,8 +64,57 @@ class CalibrationOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        problems = [*_number_problems(self), *_distortion_problems(self.distortion)]
         if self.robust not in get_args(Robust):
-            raise DataError(
-                f"options.robust: got {self.robust!r}, expected one of "
-                + ", ".join(get_args(Robust))
-            )
+            allowed = ", ".join(get_args(Robust))
+            problems.append(f"options.robust: expected one of {allowed}, got {self.robust!r}")
+        if isinstance(self.fixed, str) or not all(isinstance(x, str) for x in self.fixed):
+            problems.append(f"options.fixed: expected a tuple of names, got {self.fixed!r}")
+        problems += [
+            f"options.{name}: expected a dict, got {getattr(self, name)!r}"
+            for name in ("known", "priors")
+            if not isinstance(getattr(self, name), Mapping)
+        ]
+        if problems:
+            raise DataError(*problems)
+        object.__setattr__(self, "fixed", tuple(self.fixed))
+        if not isinstance(self.distortion, str):
+            object.__setattr__(self, "distortion", tuple(self.distortion))
+
+
+def _number_problems(options: CalibrationOptions) -> list[str]:
+    wanted = {
+        "sigma_px": (options.sigma_px is None or _finite(options.sigma_px) > 0, "a number > 0"),
+        "hand_sigma_m": (_finite(options.hand_sigma_m) >= 0, "a number >= 0 (metres)"),
+        "hand_sigma_rad": (_finite(options.hand_sigma_rad) >= 0, "a number >= 0 (radians)"),
+        "max_iterations": (
+            isinstance(options.max_iterations, int) and options.max_iterations >= 1,
+            "an integer >= 1",
+        ),
+    }
+    return [
+        f"options.{name}: expected {what}, got {getattr(options, name)!r}"
+        for name, (good, what) in wanted.items()
+        if not good
+    ]
+
+
+def _finite(value: Any) -> float:
+    """The number, or NaN where it is not one (no comparison is true of NaN)."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        return math.nan
+    return number if math.isfinite(number) else math.nan
+
+
+def _distortion_problems(wanted: Any) -> list[str]:
+    allowed = f"'all', 'none', 'auto' or names out of {', '.join(DISTORTION_NAMES)}"
+    if isinstance(wanted, str):
+        good = wanted in ("all", "none", "auto")
+    else:
+        good = isinstance(wanted, tuple | list) and all(x in DISTORTION_NAMES for x in wanted)
+    if good:
+        return []
+    hint = f"; a single name is written ({wanted!r},)" if wanted in DISTORTION_NAMES else ""
+    return [f"options.distortion: expected {allowed}, got {wanted!r}{hint}"]

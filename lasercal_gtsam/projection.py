@@ -48,8 +48,28 @@ def distort(xy: Array, intrinsics: Intrinsics) -> Array:
     return np.stack([xd, yd], axis=-1)
 
 
+def fold_radius_squared(intrinsics: Intrinsics) -> float:
+    """Squared radius (normalised, undistorted) where the radial distortion turns back, or inf.
+
+    The slope ``1 + 3 k1 r^2 + 5 k2 r^4`` first vanishes there. Beyond it the model shows again what
+    it has shown before: no lens does that.
+    """
+    a, b = 5.0 * intrinsics.k2, 3.0 * intrinsics.k1
+    discriminant = b * b - 4.0 * a
+    if discriminant < 0.0:
+        return float("inf")
+    root = np.sqrt(discriminant)
+    # 1/r^2 solves x^2 + b x + a = 0; the larger x is the smaller radius
+    largest = 0.5 * (root - b) if b <= 0.0 else (-2.0 * a / (root + b))
+    return float(1.0 / largest) if largest > 0.0 else float("inf")
+
+
 def undistort(xyd: Array, intrinsics: Intrinsics, iterations: int = 50) -> Array:
-    """Inverse of `distort` by Newton's method from ``xyd``; NaN where it does not converge."""
+    """Inverse of `distort` by Newton's method from ``xyd``; NaN where there is none.
+
+    Only points inside the fold of the distortion count (`fold_radius_squared`): beyond it Newton's
+    method would find mirrored ones.
+    """
     k1, k2, p1, p2 = intrinsics.k1, intrinsics.k2, intrinsics.p1, intrinsics.p2
     xy = np.array(xyd, dtype=np.float64)
     error = np.zeros_like(xy)
@@ -69,7 +89,9 @@ def undistort(xyd: Array, intrinsics: Intrinsics, iterations: int = 50) -> Array
             if np.nanmax(np.abs(step), initial=0.0) < 1e-15:
                 break
         error = distort(xy, intrinsics) - xyd
-        xy[~(np.abs(error).max(axis=-1) < 1e-10)] = np.nan
+        good = np.abs(error).max(axis=-1) < 1e-10
+        good &= (xy * xy).sum(axis=-1) < fold_radius_squared(intrinsics)
+    xy[~good] = np.nan
     return xy
 
 
@@ -87,11 +109,15 @@ def normalized_from_pixel(uv: Array, intrinsics: Intrinsics) -> Array:
 
 
 def project_points(points_base: Array, camera: Camera) -> Array:
-    """Base points (N, 3) to pixels (N, 2); NaN for points that are not in front of the camera."""
+    """Base points (N, 3) to pixels (N, 2); NaN where the camera cannot see them.
+
+    That is behind the camera, or outside the fold of the distortion (`fold_radius_squared`).
+    """
     R, t = camera.T_base_camera[:3, :3], camera.T_base_camera[:3, 3]
     p = (points_base - t) @ R
     z = np.where(p[..., 2] > 0, p[..., 2], np.nan)
     xy = p[..., :2] / z[..., None]
+    xy[~((xy * xy).sum(axis=-1) < fold_radius_squared(camera.intrinsics))] = np.nan
     return pixel_from_normalized(distort(xy, camera.intrinsics), camera.intrinsics)
 
 
@@ -147,12 +173,13 @@ def project(
     Returns
     -------
     (N, 2) array
-        Pixels; NaN where the beam points away from the plane or the spot lies behind the camera.
+        Pixels; NaN where the beam points away from the plane, the spot lies behind the camera, or
+        outside the fold of its distortion.
 
     Raises
     ------
     DataError
-        A name is unknown, or left out where the cell has several.
+        A name is unknown, or left out where the cell has several; an array has the wrong shape.
     """
     points = spot_on_beam(cell, T_base_hand, plane=plane, laser=laser)
     uv = np.full((len(points), 2), np.nan)
@@ -168,7 +195,7 @@ def spot_on_beam(
 
     NaN where the beam is parallel to the plane or points away from it.
     """
-    T_base_hand = np.asarray(T_base_hand, dtype=np.float64).reshape(-1, 4, 4)
+    T_base_hand = _stack(T_base_hand, (4, 4), "T_base_hand")
     count = len(T_base_hand)
     u, q = np.empty((count, 3)), np.empty((count, 3))
     for part, rows in _select(cell.lasers, laser, count, "laser"):
@@ -184,7 +211,7 @@ def spot_on_ray(cell: Cell, uv: Array, *, plane: Names = None, camera: Names = N
 
     NaN where the ray does not meet the plane in front of the camera.
     """
-    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
+    uv = _stack(uv, (2,), "uv")
     n, distance = _plane_arrays(cell, plane, len(uv))
     points = np.full((len(uv), 3), np.nan)
     for part, rows in _select(cell.cameras, camera, len(uv), "camera"):
@@ -203,8 +230,8 @@ def spot_triangulated(
     The midpoint of the shortest segment between the two lines; no plane is needed. NaN where the
     lines are parallel.
     """
-    uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-    T_base_hand = np.asarray(T_base_hand, dtype=np.float64).reshape(-1, 4, 4)
+    uv = _stack(uv, (2,), "uv")
+    T_base_hand = _stack(T_base_hand, (4, 4), "T_base_hand")
     count = len(uv)
     if len(T_base_hand) != count:
         raise DataError(f"spot_triangulated: {count} pixels but {len(T_base_hand)} hand poses")
@@ -228,6 +255,15 @@ def nearest_point(u: Array, q: Array, ray: Array, centre: Array) -> Array:
         a = (rr * uo - ur * ro) / det
         b = (ur * uo - uu * ro) / det
         return np.asarray(0.5 * (q + a[:, None] * u + centre + b[:, None] * ray))
+
+
+def _stack(value: Array, shape: tuple[int, ...], name: str) -> Array:
+    """The array as a stack of items of that shape; a single item becomes a stack of one."""
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape[-len(shape) :] != shape or array.ndim > len(shape) + 1:
+        wanted = ", ".join(map(str, shape))
+        raise DataError(f"{name}: expected shape ({wanted}) or (N, {wanted}), got {array.shape}")
+    return array.reshape(-1, *shape)
 
 
 def _plane_arrays(cell: Cell, plane: Names, count: int) -> tuple[Array, Array]:
