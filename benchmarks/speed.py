@@ -25,7 +25,7 @@ import numpy as np
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import make_batch, make_graph
+from lasercal_gtsam.graph import CELL_KEY, make_batch, make_graph
 from lasercal_gtsam.holds import resolve_holds
 from lasercal_gtsam.report_map import BeamChart, row_values
 from lasercal_gtsam.rotations import make_pose, rotation_exp
@@ -97,10 +97,12 @@ class Case:
         params = gtsam.LevenbergMarquardtParams()
         params.setRelativeErrorTol(self.tolerance)
         params.setAbsoluteErrorTol(0.0)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, problem.values(), params)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(
+            problem.graph, problem.start_values(), params
+        )
         marginals = gtsam.Marginals(problem.graph, optimizer.optimize())
-        joint = marginals.jointMarginalCovariance(list(problem.keys.keys))
-        return optimizer.error(), joint.fullMatrix()
+        joint = marginals.marginalCovariance(CELL_KEY)
+        return optimizer.error(), joint
 
     def checked(self) -> tuple[Solution, Uncertainty]:
         """The solver as `calibrate` calls it: from observations, with polish, checks and scale."""
@@ -155,7 +157,7 @@ def _repeats(seconds: float) -> int:
 def _sigmas_apart(cell: lc.Cell, solution: Solution, uncertainty: Uncertainty) -> float:
     """Largest difference of a row of the result table between two answers, in its sigmas."""
     charts = {name: BeamChart.of(beam) for name, beam in solution.cell.lasers.items()}
-    rows = table_parameters(solution.cell, solution.cell, uncertainty, solution.problem)
+    rows = table_parameters(solution.cell, solution.cell, uncertainty)
     refined, sigma = np.array([(p.refined, p.sigma) for p in rows]).T
     return float(np.max(np.abs(row_values(cell, charts) - refined) / sigma))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from lasercal_factors.beam import basis_across
 
 from lasercal_gtsam.frozen import Array
 
@@ -70,9 +71,4 @@ def basis_of(v: Array) -> Array:
 
     Deterministic and built from the coordinate axis least aligned with ``v``.
     """
-    v = v / np.linalg.norm(v)
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(v))] = 1.0
-    e1 = np.cross(v, axis)
-    e1 /= np.linalg.norm(e1)
-    return np.column_stack([e1, np.cross(v, e1)])
+    return basis_across(v / np.linalg.norm(v))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import gtsam
@@ -239,12 +240,12 @@ def fold_radius(intrinsics: Intrinsics) -> float:
     The slope ``1 + 3 k1 r^2 + 5 k2 r^4`` first vanishes there.
     """
     k1, k2 = intrinsics.k1, intrinsics.k2
-    roots = np.roots([5 * k2, 3 * k1, 1.0])
-    positive = [float(r.real) for r in roots if abs(r.imag) == 0 and r.real > 0]
-    if not positive:
-        return float("inf")
-    r2 = min(positive)
-    return float(np.sqrt(r2) * (1 + k1 * r2 + k2 * r2 * r2))
+    # smallest positive root r^2 of the slope, in the form that does not cancel
+    discriminant = 9 * k1 * k1 - 20 * k2
+    if (k1 >= 0 and k2 >= 0) or discriminant < 0:
+        return math.inf
+    r2 = 2.0 / (math.sqrt(discriminant) - 3 * k1)
+    return math.sqrt(r2) * (1 + k1 * r2 + k2 * r2 * r2)
 
 
 def _radii(uv: Array, i: Intrinsics) -> Array:

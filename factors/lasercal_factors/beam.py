@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,20 @@ import numpy.typing as npt
 from lasercal_factors.errors import FactorError
 
 Array = npt.NDArray[np.float64]
+
+
+def basis_across(v: Array) -> Array:
+    """(3, 2) orthonormal basis across the unit vector ``v``, with ``e1 x e2 = v``.
+
+    Built from the coordinate axis least aligned with ``v``, as `gtsam.Unit3.basis` is.
+    """
+    x, y, z = (float(c) for c in v)
+    i = min(range(3), key=(abs(x), abs(y), abs(z)).__getitem__)
+    # v x axis, without the overhead of a general cross product
+    a, b, c = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[i]
+    length = math.sqrt(a * a + b * b + c * c)
+    a, b, c = a / length, b / length, c / length
+    return np.array([[a, y * c - z * b], [b, z * a - x * c], [c, x * b - y * a]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +58,7 @@ class BeamFrame:
         if not 0 < length < np.inf:
             raise FactorError(f"beam direction: expected a finite non-zero vector, got {w}")
         w /= length
-        axis = np.zeros(3)
-        axis[int(np.argmin(np.abs(w)))] = 1.0
-        e = np.cross(axis, w)
-        e /= np.linalg.norm(e)
-        return cls(np.column_stack([e, np.cross(w, e), w]), np.array(point, dtype=np.float64))
+        return cls(np.column_stack([basis_across(w), w]), np.array(point, dtype=np.float64))
 
     def coordinates(self, direction: npt.ArrayLike, point: npt.ArrayLike) -> Array:
         """``(a, b, x, y)`` of a line (direction of any length, any point on it, hand frame).

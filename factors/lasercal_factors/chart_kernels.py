@@ -22,18 +22,23 @@ from lasercal_factors.kernels import (
 @jit
 def rotation(w):
     """Rotation matrix of the vector ``w`` and its right Jacobian."""
-    W = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    W2 = np.outer(w, w)
+    W = np.zeros((3, 3))
+    W[0, 1], W[0, 2], W[1, 2] = -w[2], w[1], -w[0]
+    W[1, 0], W[2, 0], W[2, 1] = w[2], -w[1], w[0]
     t2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
-    for i in range(3):
-        W2[i, i] -= t2
     t = math.sqrt(t2)
     if t < 1e-4:
         a, b, c = 1.0 - t2 / 6.0, 0.5 - t2 / 24.0, 1.0 / 6.0 - t2 / 120.0
     else:
         a, b, c = math.sin(t) / t, (1.0 - math.cos(t)) / t2, (t - math.sin(t)) / (t2 * t)
-    identity = np.eye(3)
-    return identity + a * W + b * W2, identity - b * W + c * W2
+    turn, right = np.empty((3, 3)), np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            one = 1.0 if i == j else 0.0
+            square = w[i] * w[j] - one * t2
+            turn[i, j] = one + a * W[i, j] + b * square
+            right[i, j] = one - b * W[i, j] + c * square
+    return turn, right
 
 
 @jit
@@ -90,17 +95,23 @@ def normal_map(n, moved_n, tilt):
 @jit
 def _change_columns(H, at, M):
     """Replace columns and rows ``at ...`` of a symmetric ``H`` by their combinations ``M``."""
-    k = len(M)
-    old = H[:, at : at + k].copy()
-    for j in range(k):
-        H[:, at + j] = 0.0
+    k, old = len(M), np.empty(3)
+    for r in range(len(H)):
         for i in range(k):
-            H[:, at + j] += old[:, i] * M[i, j]
-    old = H[at : at + k, :].copy()
-    for j in range(k):
-        H[at + j, :] = 0.0
+            old[i] = H[r, at + i]
+        for j in range(k):
+            v = 0.0
+            for i in range(k):
+                v += old[i] * M[i, j]
+            H[r, at + j] = v
+    for c in range(len(H)):
         for i in range(k):
-            H[at + j, :] += M[i, j] * old[i, :]
+            old[i] = H[at + i, c]
+        for j in range(k):
+            v = 0.0
+            for i in range(k):
+                v += old[i] * M[i, j]
+            H[at + j, c] = v
 
 
 @jit
@@ -116,8 +127,10 @@ def transport(H, z, plane_n, moved_n, cameras, lasers):
     for p in range(len(plane_n)):
         _change_columns(H, at, normal_map(plane_n[p], moved_n[p], z[at : at + 2]))
         # the rows' offset is GTSAM's, -d
-        H[:, at + 2] *= -1.0
-        H[at + 2, :] *= -1.0
+        for i in range(len(H)):
+            H[i, at + 2] = -H[i, at + 2]
+        for i in range(len(H)):
+            H[at + 2, i] = -H[at + 2, i]
         at += 3
 
 

@@ -501,12 +501,15 @@ def constrain(H, held, tie_from, tie_to, tie_ratio):
     not move and the rest is as if they were not there.
     """
     for t in range(len(tie_from)):
-        H[:, tie_to[t]] += tie_ratio[t] * H[:, tie_from[t]]
-        H[tie_to[t], :] += tie_ratio[t] * H[tie_from[t], :]
+        for i in range(len(H)):
+            H[i, tie_to[t]] += tie_ratio[t] * H[i, tie_from[t]]
+        for i in range(len(H)):
+            H[tie_to[t], i] += tie_ratio[t] * H[tie_from[t], i]
     for i in range(len(H) - 1):
         if held[i]:
-            H[i, :] = 0.0
-            H[:, i] = 0.0
+            for j in range(len(H)):
+                H[i, j] = 0.0
+                H[j, i] = 0.0
             H[i, i] = 1.0
 
 
