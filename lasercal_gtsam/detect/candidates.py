@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from lasercal_gtsam.detect.difference import Difference, Image, clipped_sigma
-from lasercal_gtsam.detect.gaussian import Mask
+from lasercal_gtsam.detect.difference import Difference, Image, Mask, clipped_sigma
 
 FINE, MIDDLE, COARSE = 1.2, 3.0, 9.0  # px; differences of Gaussians: fine-middle, middle-coarse
 _SAMPLES = 40_000

@@ -8,6 +8,7 @@ import numpy as np
 
 from lasercal_gtsam.detect import gaussian
 from lasercal_gtsam.detect.centre import CORE, PROFILE_ERROR, SpotFit
+from lasercal_gtsam.detect.difference import Mask
 from lasercal_gtsam.frozen import Array
 
 # centre error per radius of the clipped core: what is clipped hides a shifted flare
@@ -94,7 +95,7 @@ def estimate_speckle(spot: SpotFit) -> Speckle:
 
 
 def _neighbours(
-    window: gaussian.Window, residual: Array, model: Array, core: gaussian.Mask
+    window: gaussian.Window, residual: Array, model: Array, core: Mask
 ) -> tuple[float, float]:
     """Sums of ``m_i m_j r_i r_j`` and ``(m_i m_j)^2`` over core pixels that touch."""
     product, weight = np.zeros(window.inside.shape), np.zeros(window.inside.shape)

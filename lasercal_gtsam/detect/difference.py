@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 Image = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
 
 _MATCH_SAMPLES = 15_000
 _SAMPLES = 40_000  # pixels that a global statistic is taken from
@@ -44,7 +45,12 @@ class Difference:
 
 
 def pair_difference(
-    on: Image, off: Image, step: float, clutter_shift_px: float, clutter_gain: float
+    on: Image,
+    off: Image,
+    step: float,
+    clutter_shift_px: float,
+    clutter_gain: float,
+    blind: Mask | None = None,
 ) -> Difference:
     """Difference of a laser-on and a laser-off frame of the same scene.
 
@@ -57,6 +63,7 @@ def pair_difference(
     on, off : (height, width) float32
     step : quantisation step of the pictures, 0 if unknown
     clutter_shift_px, clutter_gain : see `DetectionOptions`
+    blind : clipped pixels of the off frame; nothing can be told there
     """
     light = on - off
     gx, gy = _gradient(off)
@@ -64,6 +71,9 @@ def pair_difference(
     light -= np.float32(gain) * off
     light += np.float32(shift[0]) * gx
     light += np.float32(shift[1]) * gy
+    if blind is not None:
+        # clipped in both frames, they did not follow the lamp
+        light[blind] = np.minimum(light[blind], 0)
     clutter = cv2.magnitude(gx, gy)
     cv2.addWeighted(clutter, clutter_shift_px, off, clutter_gain, 0.0, dst=clutter)
     noise = noise_sigma(light, step * np.sqrt(2))
@@ -161,7 +171,6 @@ class Patch:
     light: Image
     variance: Image
     corner: tuple[int, int]
-    divided: bool
 
 
 def cut_patch(
@@ -184,7 +193,7 @@ def cut_patch(
     variance = np.full(light.shape, difference.noise**2, dtype=np.float32)
     corner = (columns.start, rows.start)
     if not divide or difference.off is None:
-        return Patch(light, variance, corner, divided=False)
+        return Patch(light, variance, corner)
     ambient = cv2.GaussianBlur(
         difference.off[rows, columns] - np.float32(black_level), (0, 0), _ALBEDO_BLUR
     )
@@ -194,6 +203,6 @@ def cut_patch(
     noise = difference.off_noise / (2 * np.sqrt(np.pi) * _ALBEDO_BLUR)
     blank = float(ambient.std()) < 1.5 * noise
     if blank or low < 10 * difference.off_noise or high > _ALBEDO_RANGE * low:
-        return Patch(light, variance, corner, divided=False)
+        return Patch(light, variance, corner)
     albedo = _image(ambient / np.float32(reference))
-    return Patch(_image(light / albedo), _image(variance / albedo**2), corner, divided=True)
+    return Patch(_image(light / albedo), _image(variance / albedo**2), corner)

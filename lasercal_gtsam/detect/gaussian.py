@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from lasercal_gtsam.detect.difference import Mask
 from lasercal_gtsam.frozen import Array
-
-Mask = npt.NDArray[np.bool_]
 
 # parameters: amplitude, u, v, l1, l2, l3, background; with L = [[l1, l2], [0, l3]] the shape's
 # inverse covariance is L'L, positive definite for any l1, l3 > 0

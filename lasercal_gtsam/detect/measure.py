@@ -11,8 +11,7 @@ from lasercal_gtsam.detect import gaussian
 from lasercal_gtsam.detect.background import measure_background
 from lasercal_gtsam.detect.candidates import FINE, Candidate
 from lasercal_gtsam.detect.centre import SpotFit, fit_spot
-from lasercal_gtsam.detect.difference import Difference, Image, Patch, cut_patch
-from lasercal_gtsam.detect.gaussian import Mask
+from lasercal_gtsam.detect.difference import Difference, Image, Mask, Patch, cut_patch
 from lasercal_gtsam.detect.guard import CORE_LEVEL, Centre, choose_centre
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.detect.picture import Frames

@@ -45,8 +45,8 @@ class DetectionOptions:
         Largest ratio of the spot's axes.
     max_saturated_share
         Number of saturated pixels over the number above half of the clipped peak, above which a
-        spot is not used. (0.9 is met at about 50 times the light that saturates; saturation below
-        the limit is in the covariance.)
+        spot is not used. (0.9 is met at some hundred times the light that saturates; saturation
+        below the limit is in the covariance.)
     min_snr
         Peak over background noise below which a spot is not used.
     max_sigma_px

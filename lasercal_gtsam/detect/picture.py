@@ -7,9 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
-from lasercal_gtsam.detect.difference import Image, noise_sigma, smooth_background
+from lasercal_gtsam.detect.difference import Image, Mask, noise_sigma, smooth_background
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.errors import DetectionError
 
@@ -17,21 +16,23 @@ _COLOURS = ("blue", "green", "red")
 _PLATEAU = 4  # equal pixels at the maximum that betray clipping below the type's largest value
 _NEAR = 15  # px about the brightest point in which a channel's clipped pixels are counted
 _USEFUL_SHARE = 0.1  # of the strongest channel's peak: below, an unclipped channel is no help
-_USEFUL_SNR = 10.0
+_USEFUL_SNR = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
     """One channel of a picture and of its laser-off partner.
 
-    ``step`` is the quantisation step (0 if unknown), ``saturated`` the mask of clipped pixels.
+    ``step`` is the quantisation step (0 if unknown), ``saturated`` the mask of clipped pixels of
+    the on frame, ``blind`` that of the off frame: no laser can be seen on what is white without it.
     """
 
     channel: str
     on: Image
     off: Image | None
     step: float
-    saturated: npt.NDArray[np.bool_]
+    saturated: Mask
+    blind: Mask | None
 
 
 def read_frames(on: Any, off: Any, options: DetectionOptions) -> Frames:
@@ -56,10 +57,13 @@ def read_frames(on: Any, off: Any, options: DetectionOptions) -> Frames:
     if on.ndim == 2:
         return _frames("mono", on, off, step, level)
     if options.channel == "gray":
-        clipped = np.max([_clipped(on[..., k], level) for k in range(3)], axis=0)
-        gray = [None if x is None else cv2.cvtColor(x, cv2.COLOR_BGR2GRAY) for x in (on, off)]
         return Frames(
-            "gray", _float(gray[0]), _float(gray[1]) if off is not None else None, step, clipped
+            channel="gray",
+            on=_gray(on),
+            off=None if off is None else _gray(off),
+            step=step,
+            saturated=_any_clipped(on, level),
+            blind=None if off is None else _any_clipped(off, level),
         )
     if options.channel == "auto":
         channel = _lit_channel(on, off, level)
@@ -71,8 +75,22 @@ def read_frames(on: Any, off: Any, options: DetectionOptions) -> Frames:
 
 def _frames(channel: str, on: Any, off: Any, step: float, level: float | None) -> Frames:
     return Frames(
-        channel, _float(on), None if off is None else _float(off), step, _clipped(on, level)
+        channel=channel,
+        on=_float(on),
+        off=None if off is None else _float(off),
+        step=step,
+        saturated=_clipped(on, level),
+        blind=None if off is None else _clipped(off, level),
     )
+
+
+def _gray(image: Any) -> Image:
+    return _float(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+
+
+def _any_clipped(image: Any, level: float | None) -> Mask:
+    """Pixels with a clipped channel."""
+    return np.asarray(np.logical_or.reduce([_clipped(image[..., k], level) for k in range(3)]))
 
 
 def _float(image: Any) -> Image:
@@ -102,11 +120,11 @@ def _checked(picture: Any, name: str) -> Any:
             f"{name} frame: expected 8 x 8 pixels or more, got {_describe(picture)}"
         )
     if picture.dtype.kind == "f":
-        if not np.isfinite(picture).all():
-            raise DetectionError(
-                f"{name} frame: {int((~np.isfinite(picture)).sum())} pixels are not finite"
-            )
-        picture = picture.astype(np.float32)
+        with np.errstate(over="ignore"):
+            picture = picture.astype(np.float32)
+        bad = int(np.count_nonzero(~np.isfinite(picture)))
+        if bad:
+            raise DetectionError(f"{name} frame: {bad} pixels are not finite")
     return picture
 
 
@@ -115,7 +133,7 @@ def _describe(picture: Any) -> str:
     return f"{picture.shape[1]} x {picture.shape[0]} {picture.dtype} {kind}"
 
 
-def _clipped(image: Any, level: float | None) -> npt.NDArray[np.bool_]:
+def _clipped(image: Any, level: float | None) -> Mask:
     """Pixels at saturation; see `DetectionOptions.saturation_level`."""
     if level is not None:
         return np.asarray(image >= level)
@@ -135,11 +153,11 @@ def _lit_channel(on: Any, off: Any, level: float | None) -> int:
     for k in range(3):
         channel = _float(on[..., k])
         dark = smooth_background(channel) if off is None else _float(off[..., k])
-        light = cv2.GaussianBlur(channel - dark, (0, 0), 1.2)
-        _, peak, _, place = cv2.minMaxLoc(light)
+        light = channel - dark
+        _, peak, _, place = cv2.minMaxLoc(cv2.GaussianBlur(light, (0, 0), 1.2))
         peaks.append(peak)
         places.append(place)
-        noises.append(noise_sigma(_float(light)))
+        noises.append(noise_sigma(light))
         clipped.append(_clipped(on[..., k], level))
     strongest = int(np.argmax(peaks))
     u, v = places[strongest]

@@ -46,7 +46,12 @@ def detect_spot(on: Any, off: Any = None, options: DetectionOptions | None = Non
         difference = single_difference(frames.on, frames.step)
     else:
         difference = pair_difference(
-            frames.on, frames.off, frames.step, options.clutter_shift_px, options.clutter_gain
+            frames.on,
+            frames.off,
+            frames.step,
+            options.clutter_shift_px,
+            options.clutter_gain,
+            frames.blind,
         )
     candidates = find_candidates(difference, options.threshold_sigmas)
     if not candidates.ranked:

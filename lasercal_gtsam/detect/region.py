@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 
 from lasercal_gtsam.detect.candidates import FINE, Candidate
-from lasercal_gtsam.detect.difference import Image
-from lasercal_gtsam.detect.gaussian import Mask
+from lasercal_gtsam.detect.difference import Image, Mask
 from lasercal_gtsam.frozen import Array
 
 LEVEL = 0.2  # of the peak: what is above belongs to the spot

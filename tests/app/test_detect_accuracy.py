@@ -164,3 +164,27 @@ def test_random_mixture_is_accurate_and_honest():
     assert len(nees) > 390
     assert np.sqrt(np.mean(np.square(rms))) < 0.17
     assert np.mean(np.array(nees) < 5.991) > 0.92
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["paper", "table2-2", "tool-z", "no-groups"])
+def test_pictures_of_simulated_cells(preset):
+    from lasercal_gtsam.detect import detect_spot
+    from lasercal_gtsam.simulate.pictures import render_pictures
+    from lasercal_gtsam.simulate.simulation import simulate
+
+    errors, nees, taken, count = [], [], 0, 0
+    for seed in range(3):
+        for shot in render_pictures(simulate(preset, seed)):
+            found = detect_spot(shot.on, shot.off)
+            count += 1
+            if found.usable:
+                taken += 1
+                error = found.uv - shot.uv
+                errors.append(error)
+                nees.append(error @ np.linalg.solve(found.cov_uv, error))
+    distances = np.hypot(*np.array(errors).T)
+    assert taken > 0.9 * count
+    assert np.sqrt(np.mean(distances**2)) < 0.25
+    assert distances.max() < 2.0
+    assert np.mean(np.array(nees) < 5.991) > 0.85

@@ -61,6 +61,15 @@ def test_no_false_alarm_on_frames_without_a_spot(jitter):
         assert "sigma of the background" in found.reason
 
 
+def test_clipped_highlights_do_not_light_up_when_the_lamp_flickers():
+    # they stay at full scale while the rest is matched to the lamp
+    options = replace(ROUGH, flicker=0.06, highlights=6)
+    for seed in range(20):
+        on, off = picture(None, options, FRAME, seed=seed)
+        assert np.count_nonzero(off == 255) > 0
+        assert detect_spot(on, off).verdict == "none"
+
+
 def test_a_strong_ghost_is_flagged_and_a_weak_one_is_not():
     options = replace(PLAIN, spot_level=0.4)
     on, off = picture((60.0, 60.0), options)
