@@ -97,9 +97,7 @@ class Case:
         params = gtsam.LevenbergMarquardtParams()
         params.setRelativeErrorTol(self.tolerance)
         params.setAbsoluteErrorTol(0.0)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(
-            problem.graph, problem.start_values(), params
-        )
+        optimizer = gtsam.LevenbergMarquardtOptimizer(problem.graph, problem.start_values(), params)
         marginals = gtsam.Marginals(problem.graph, optimizer.optimize())
         joint = marginals.marginalCovariance(CELL_KEY)
         return optimizer.error(), joint
