@@ -35,8 +35,9 @@ def beam_residuals(planes: list[PlaneSpots], u: Array, q: Array) -> tuple[Array,
         depth = plane.m @ found.c
         beam = plane.R @ u
         free = np.zeros((len(plane), 2, 4))
-        # turning u by alpha along E_u turns e_i by -alpha_i u
-        turned = (beam * plane.t).sum(-1) * depth - (beam * (plane.m @ found.A.T)).sum(-1)
+        # turning u by alpha along E_u turns e_i by -alpha_i u, also in tau_i = e_i'q
+        along = (beam * plane.t).sum(-1) + (u @ q) / plane.rho
+        turned = along * depth - (beam * (plane.m @ found.A.T)).sum(-1)
         free[:, 0, 0] = free[:, 1, 1] = turned
         free[:, 0, 2] = free[:, 1, 3] = -depth / plane.rho
         J = free.reshape(-1, 4)

@@ -18,6 +18,11 @@ from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.rotations import basis_of, nearest_rotation
 
+_ROUNDING = 1e-12
+_TILT = (
+    "the images of the planes give no focal length: tilt a plane by 20 deg or more against the "
+    "image, about an axis that is not the image's u or v axis"
+)
 FOCAL_GRID = (0.5, 0.7, 1.0, 1.4, 2.0, 3.0)
 """Focal lengths tried when nothing else gives one, in image diagonals."""
 
@@ -145,16 +150,15 @@ def focal_lengths(G: Array, weights: Array, aspect: float | None = None) -> tupl
     rows = (
         np.concatenate([g1 * g2, 0.5 * (g1 * g1 - g2 * g2)]) * np.tile(np.sqrt(weights), 2)[:, None]
     )
+    if np.abs(rows[:, 2]).max() <= _ROUNDING * np.abs(rows[:, :2]).max():
+        raise DegenerateError(_TILT)
     if aspect is None:
         x, gap = scaled_solve(rows[:, :2], -rows[:, 2])
     else:
         x, gap = scaled_solve((rows[:, 0] / aspect**2 + rows[:, 1])[:, None], -rows[:, 2])
         x = np.array([x[0] / aspect**2, x[0]])
     if not (gap > 1e-9 and x.min() > 0 and np.isfinite(x).all()):
-        raise DegenerateError(
-            "the images of the planes give no focal length: tilt a plane by 20 deg or more against "
-            "the image, about an axis that is not the image's u or v axis"
-        )
+        raise DegenerateError(_TILT)
     fu, fv = 1.0 / np.sqrt(x)
     return float(fu), float(fv)
 

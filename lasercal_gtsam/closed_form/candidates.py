@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.closed_form.camera import KnownIntrinsics
-from lasercal_gtsam.closed_form.complete import complete_cell
+from lasercal_gtsam.closed_form.complete import complete_cell, is_complete
 from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, find_groups, thinned
 from lasercal_gtsam.closed_form.information import check_information
 from lasercal_gtsam.closed_form.pair import PairCandidate, solve_pair
@@ -113,11 +113,17 @@ def closed_form_candidates(
     refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
         chosen = [pair.found[min(k, len(pair.found) - 1)] for pair in pairs]
-        try:
-            cell = complete_cell(_merged(pairs, chosen), observations, known, reasons)
-        except DegenerateError as error:
-            refusal = refusal or error
+        cell = _merged(pairs, chosen)
+        whole = is_complete(cell, observations)
+        # what the better start could not complete, a worse one completes from its errors only
+        if refusal and not whole:
             continue
+        if not whole:
+            try:
+                cell = complete_cell(cell, observations, known, reasons)
+            except DegenerateError as error:
+                refusal = error
+                continue
         rms, negative = cell_reprojection(cell, observations)
         candidates.append(Candidate(cell, rms, chosen[-1].method, negative))
     if not candidates and refusal:

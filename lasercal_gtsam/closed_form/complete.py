@@ -69,6 +69,15 @@ def complete_cell(
     return cell
 
 
+def is_complete(cell: Cell, observations: Observations) -> bool:
+    """Whether the cell has every camera, laser and plane that the spots name."""
+    return not (
+        _missing(observations.cameras, cell.cameras)
+        or _missing(observations.lasers, cell.lasers)
+        or _missing(observations.planes, cell.planes)
+    )
+
+
 def find_plane(cell: Cell, spots: Observations) -> Plane | None:
     """Plane through triangulated spots, corrected (14); None with fewer than 3 or all in a line."""
     if len(spots) < SPOTS_FOR_PLANE:

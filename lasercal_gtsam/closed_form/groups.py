@@ -17,6 +17,7 @@ from lasercal_gtsam.units import RAD_PER_DEG
 
 GROUP_TOLERANCE_RAD = 0.05 * RAD_PER_DEG
 MOST_SPOTS = 3000
+_FEWEST_OF_A_PLANE = 200
 SMALLEST_GROUP = 4
 """Four shots fix the homography of a group."""
 
@@ -141,12 +142,12 @@ def thinned(
     kept: list[Index] = []
     for p in range(spots.plane_count):
         rows = spots.on_plane(p)
-        budget = max(-(-most * len(rows) // len(spots)), min(len(rows), 200))
+        budget = max(most * len(rows) // len(spots), _FEWEST_OF_A_PLANE)
         members = np.split(
             rows[np.argsort(labels[rows], kind="stable")],
             np.cumsum(np.unique(labels[rows], return_counts=True)[1])[:-1],
         )
-        step = max(1, len(rows) // budget)
+        step = -(-len(rows) // budget)
         if len(members) >= 10 * step:
             kept += members[::step]
         else:

@@ -219,6 +219,8 @@ def _remedy(cell: Cell, named: list[str]) -> str:
             "all intrinsics need one hand orientation or more on each of three planes, or two or "
             "more on each of two planes; or say what is known (principal point, skew, aspect)"
         )
+    if all(name.startswith("plane") for name in named):
+        return "add spots on it, away from the line through the others"
     return (
         "turn the hand by 20 deg or more about at least two axes, so that the beam changes its "
         "direction, and translate it by several centimetres across the beam"

@@ -3,7 +3,7 @@
 The order of the stages is here and nowhere else: directions, beams, spots, cameras.
 
 The spots are taken as they are, without distortion: with the strong one of the paper's cell
-(k1 = -0.55) the start is off by a few per cent and its RMS by a few pixels, and the refinement still
+(k1 = -0.55) the start is off by a few per cent and its RMS a few pixels, and the refinement still
 ends in the same optimum.
 """
 

@@ -62,22 +62,21 @@ def check_orientations(R: Array) -> None:
     DegenerateError
         One orientation only, two, or all turned about one axis.
     """
-    count = 1 + int(
-        group_labels(R, np.zeros(len(R), dtype=np.int64), DISTINCT_ORIENTATION_RAD).max()
-    )
-    if count == 1:
+    turns = (R - R.mean(axis=0)).reshape(-1, 3)
+    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
+    turned = s / np.sqrt(len(R)) > SMALLEST_TURN_RAD
+    if not turned.any():
         raise DegenerateError(
             f"all {len(R)} shots have the same hand orientation, so the beam's place in the hand "
             f"and the camera's place in the base cannot be told apart: {_THREE}"
         )
-    turns = (R - R.mean(axis=0)).reshape(-1, 3)
-    _, s, Vt = np.linalg.svd(turns, full_matrices=False)
-    if s[2] / np.sqrt(len(R)) < SMALLEST_TURN_RAD:
+    if not turned.all():
         axis = ", ".join(f"{x:.3f}" for x in Vt[2])
+        one_plane = np.zeros(len(R), dtype=np.int64)
         what = (
             f"the shots have only two hand orientations, one turned about ({axis}, hand frame) "
             "against the other"
-            if count == 2
+            if group_labels(R, one_plane, DISTINCT_ORIENTATION_RAD).max() == 1
             else f"all hand orientations turn about one axis ({axis} in the hand frame)"
         )
         raise DegenerateError(
