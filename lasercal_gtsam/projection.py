@@ -26,7 +26,7 @@ Names = str | Sequence[str] | None
 
 
 def beam_in_base(T_base_hand: Array, beam: Beam) -> tuple[Array, Array]:
-    """Direction and point of the beam in the base (2), (3): two arrays (N, 3)."""
+    """Direction and point of the beam in the base (7): two arrays (N, 3)."""
     R, t = T_base_hand[..., :3, :3], T_base_hand[..., :3, 3]
     return R @ beam.direction_hand, R @ beam.point_hand + t
 
@@ -38,7 +38,7 @@ def beam_plane_distance(u: Array, q: Array, n: Array, distance: Array | float) -
 
 
 def distort(xy: Array, intrinsics: Intrinsics) -> Array:
-    """Normalised coordinates with radial and tangential distortion (6), (7): (N, 2)."""
+    """Normalised coordinates with radial and tangential distortion (2), (3): (N, 2)."""
     x, y = xy[..., 0], xy[..., 1]
     r2 = x * x + y * y
     g = 1 + r2 * (intrinsics.k1 + intrinsics.k2 * r2)
@@ -96,7 +96,7 @@ def undistort(xyd: Array, intrinsics: Intrinsics, iterations: int = 50) -> Array
 
 
 def pixel_from_normalized(xyd: Array, intrinsics: Intrinsics) -> Array:
-    """Distorted normalised coordinates to pixels (5): (N, 2)."""
+    """Distorted normalised coordinates to pixels (1): (N, 2)."""
     u = intrinsics.fu * xyd[..., 0] + intrinsics.skew * xyd[..., 1] + intrinsics.u0
     return np.stack([u, intrinsics.fv * xyd[..., 1] + intrinsics.v0], axis=-1)
 
