@@ -164,9 +164,10 @@ def _report(result: Calibration, capture: Capture, account: SpotAccount) -> list
     ]
     if pictures := looked_at(account):
         lines.append(f"{count(pictures, 'picture')} looked at")
-    skipped = account_lines(account, f"see 'lasercal detect {capture.path.parent}'")
-    if skipped:
+    see = f"'lasercal detect {capture.path.parent}' draws them"
+    if skipped := account_lines(account, see):
         lines += [f"{count(len(account.skipped), 'row')} without a usable spot:", *skipped]
+        lines += [f"  {see}"] if pictures else []
     return [*lines, "", *result_lines(result)]
 
 

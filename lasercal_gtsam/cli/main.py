@@ -64,6 +64,9 @@ def main(args: Sequence[str] | None = None) -> int:
         for line in str(error).splitlines():
             click.echo(f"Error: {line}", err=True)
         return FAILED
+    except OSError as error:  # a full disk, a terminal that is gone
+        click.echo(f"Error: {error}", err=True)
+        return FAILED
     return status if isinstance(status, int) else 0
 
 
