@@ -83,6 +83,7 @@ def calibrate(
     else:
         start = initial
         solution = refine_given(search, initial)
+    search = replace(search, holds=solution.problem.holds)
     if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
         search, solution = _with_hand_noise(search, solution)
     reasons: tuple[str | None, ...] = (None,) * len(observations)
@@ -143,7 +144,7 @@ def _fit(
         status = "not to be trusted: " + "; ".join(solution.troubles)
     else:
         status = (
-            f"converged in {solution.iterations} iterations: {len(residuals)} spots, "
+            f"converged ({solution.iterations} iterations): {len(residuals)} spots, "
             f"RMS {rms:.3g} px"
         )
         if n_rejected:
@@ -176,10 +177,10 @@ def _with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Soluti
             observations, cov, solution.cell, options.hand_sigma_m, options.hand_sigma_rad, eta
         )
         search = replace(search, batch=batch)
-        better = search.solve_from(solution.cell, solution.problem.holds)
+        better = search.solve_from(solution.cell)
         if better is None:
             break
-        solution = better
+        solution = replace(better, iterations=solution.iterations + better.iterations)
     return search, solution
 
 

@@ -67,7 +67,7 @@ def reject_outliers(
         robust = replace(search, loss=loss).solve_from(current.cell)
         if robust is None:
             break
-        before, current = scale, robust
+        before, current = scale, _after(current, robust)
         lengths, scale = _lengths(search, current, unknowns)
         if abs(scale - before) < 0.01 * before:
             break
@@ -75,14 +75,18 @@ def reject_outliers(
     rejected = np.zeros(count, dtype=np.bool_)
     for _ in range(_ROUNDS):
         found = ~(lengths <= limit * scale)
-        if np.array_equal(found, rejected) or found.mean() > _MAX_SHARE:
+        if found.mean() > _MAX_SHARE:
+            trouble = f"{found.sum()} of {count} spots do not fit the cell that the others agree on"
+            troubled = replace(solution, troubles=(*solution.troubles, trouble))
+            return search, troubled, (None,) * count
+        if np.array_equal(found, rejected):
             break
         rejected = found
         kept = replace(search, batch=search.batch.weighted(~rejected))
         refit = kept.solve_from(current.cell)
         if refit is None:
             break
-        current = refit
+        current = _after(current, refit)
         lengths, scale = _lengths(search, current, unknowns)
     if not rejected.any():
         return search, solution, (None,) * count
@@ -91,6 +95,11 @@ def reject_outliers(
         for k in range(count)
     )
     return replace(search, batch=search.batch.weighted(~rejected)), current, reasons
+
+
+def _after(before: Solution, solution: Solution) -> Solution:
+    """The solution with the iterations spent before it counted in."""
+    return replace(solution, iterations=before.iterations + solution.iterations)
 
 
 def _lengths(search: Search, solution: Solution, unknowns: int) -> tuple[Array, float]:
