@@ -515,23 +515,25 @@ def constrain(H, held, tie_from, tie_to, tie_ratio):
 
 @jit
 def cholesky(H):
-    """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1); zero rows for null pivots."""
+    """Upper ``R`` with ``R.T @ R = H``, (n+1, n+1); zero rows for null pivots.
+
+    Row by row, so that the inner loop runs along memory.
+    """
     size = len(H)
-    Rt = np.zeros((size, size))
+    R = np.zeros((size, size))
+    row = np.empty(size)
     for i in range(size):
-        pivot = H[i, i]
+        for j in range(i, size):
+            row[j] = H[i, j]
         for k in range(i):
-            pivot -= Rt[i, k] * Rt[i, k]
-        if not pivot > 1e-15 * H[i, i]:
-            continue
-        root = math.sqrt(pivot)
-        Rt[i, i] = root
-        for j in range(i + 1, size):
-            v = H[i, j]
-            for k in range(i):
-                v -= Rt[i, k] * Rt[j, k]
-            Rt[j, i] = v / root
-    return np.ascontiguousarray(Rt.T)
+            factor = R[k, i]
+            for j in range(i, size):
+                row[j] -= factor * R[k, j]
+        if row[i] > 1e-15 * H[i, i]:
+            scale = 1.0 / math.sqrt(row[i])
+            for j in range(i, size):
+                R[i, j] = scale * row[j]
+    return R
 
 
 @jit
