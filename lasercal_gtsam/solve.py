@@ -50,6 +50,11 @@ class Solution:
     troubles: tuple[str, ...]
 
     @property
+    def objective(self) -> float:
+        """What is compared between solutions: ``cost`` plus the priors in the same units."""
+        return self.total_cost * self.problem.scale**2
+
+    @property
     def plausible(self) -> bool:
         """Whether every check passed."""
         return not self.troubles

@@ -5,6 +5,7 @@ Deterministic: the same observations and options give the same path and the same
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -127,12 +128,12 @@ def best_of(solutions: Iterable[Solution]) -> Solution:
     A model without a fold in the image is preferred to one that folds beyond the spots where the
     data do not speak against it.
     """
-    ranked = sorted(solutions, key=lambda s: (len(s.troubles) > 0, s.cost))
+    ranked = sorted(solutions, key=lambda s: (len(s.troubles) > 0, s.objective))
     best = ranked[0]
     if fold_warnings(best.cell):
         noise = best.cost / max(2 * best.problem.batch.used.sum() - best.problem.free.sum(), 1)
         for other in ranked[1:]:
-            close = other.cost <= best.cost + _FOLD_CHI2 * noise
+            close = other.objective <= best.objective + _FOLD_CHI2 * noise
             if close and other.plausible == best.plausible and not fold_warnings(other.cell):
                 return other
     return best
@@ -214,7 +215,7 @@ def _stage_priors(search: Search) -> dict[str, tuple[float, float]]:
 
 
 def _same_cost(a: Solution, b: Solution) -> bool:
-    return abs(a.cost - b.cost) <= _SAME_COST * max(a.cost, b.cost) + 1e-12
+    return math.isclose(a.objective, b.objective, rel_tol=_SAME_COST, abs_tol=1e-12)
 
 
 def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
@@ -244,8 +245,7 @@ def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
 
 def _quick_sigma(solution: Solution, column: int) -> float:
     """Marginal sigma of one tangent coordinate; infinite where it is undetermined."""
-    problem = solution.problem
-    problem = problem.anchored(solution.cell)
+    problem = solution.problem.anchored(solution.cell)
     R, free = problem.rows(problem.start_values()), problem.free
     unit = np.zeros(problem.chart.n)
     unit[column] = 1.0
