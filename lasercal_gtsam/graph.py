@@ -13,7 +13,8 @@ from typing import Any
 import gtsam
 import numpy as np
 import numpy.typing as npt
-from lasercal_factors.batch import Loss, SpotBatch, State
+from lasercal_factors.arrays import State
+from lasercal_factors.batch import Loss, SpotBatch
 from lasercal_factors.beam import BeamFrame
 from lasercal_factors.chart import CellChart, LaserCellFactor
 from lasercal_factors.wrap import custom_factor
@@ -102,7 +103,8 @@ class CellGraph:
 
     def spot_pixels(self, camera: int) -> Array:
         """Seen pixels of the camera with that index, (M, 2)."""
-        parts = [self.batch.pixels[:2, b[3] : b[4]] for b in self.batch.blocks if b[0] == camera]
+        pixels, _, blocks = self.batch.spots
+        parts = [pixels[:2, b[3] : b[4]] for b in blocks if b[0] == camera]
         return np.concatenate(parts, axis=1).T if parts else np.empty((0, 2))
 
 

@@ -186,7 +186,7 @@ def _short(search: Search, holds: Holds, cell: Cell) -> tuple[Cell, float] | Non
 
 def _typical_sigma(search: Search) -> float:
     """Typical a-priori pixel sigma of the batch."""
-    return float(1.0 / np.median(search.batch.pixels[4]))
+    return float(1.0 / np.median(search.batch.spots.pixels[4]))
 
 
 def _stage_priors(search: Search) -> dict[str, tuple[float, float]]:

@@ -19,7 +19,7 @@ _EXPORTS = {
     "LasercalError": "errors",
     "Loss": "batch",
     "SpotBatch": "batch",
-    "State": "batch",
+    "State": "arrays",
     "check_jacobians": "checks",
     "custom_factor": "wrap",
     "keys_for": "spot",
@@ -43,7 +43,8 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from lasercal_factors.batch import Loss, SpotBatch, State
+    from lasercal_factors.arrays import State
+    from lasercal_factors.batch import Loss, SpotBatch
     from lasercal_factors.beam import BeamFrame
     from lasercal_factors.chart import CellChart, LaserCellFactor
     from lasercal_factors.checks import check_jacobians

@@ -1,19 +1,18 @@
-"""Spots of a cell as plain arrays for the kernels, and the state they are predicted from."""
+"""Spots of a cell, whitened and sorted for the compiled kernels."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from lasercal_factors import kernels
+from lasercal_factors.arrays import Array, Index, Spots, State
 from lasercal_factors.errors import FactorError
 
-Array = npt.NDArray[np.float64]
-Index = npt.NDArray[np.int64]
 LossName = Literal["none", "huber", "cauchy", "geman-mcclure"]
 IMPOSSIBLE = (
     "linearised where a beam misses its plane, a spot lies behind its camera, or the distortion "
@@ -34,33 +33,18 @@ class Loss:
             raise FactorError(f"loss: one of {', '.join(LOSSES)}, threshold > 0; got {self}")
 
 
-class State(NamedTuple):
-    """Values of a cell's variables as plain arrays (see `kernels`)."""
-
-    cam_R: Array
-    cam_t: Array
-    cam_K: Array
-    beam_R: Array
-    beam_t: Array
-    beam_l: Array
-    plane_n: Array
-    plane_d: Array
-
-
 @dataclass(frozen=True, eq=False)
 class SpotBatch:
     """Spots sorted into blocks of equal camera, laser and plane; build it with `from_arrays`.
 
     Attributes
     ----------
-    pixels, hands, blocks : see `kernels`; spots along the last axis
+    spots : arrays for the kernels
     order : (N,) input index of each spot held
     size : number of spots given (some may have been left out by `weighted`)
     """
 
-    pixels: Array
-    hands: Array
-    blocks: Index
+    spots: Spots
     order: Index
     size: int
 
@@ -100,13 +84,10 @@ class SpotBatch:
         whitening = whitening_from_covariance(np.asarray(cov_uv, dtype=np.float64))
         pixels = np.concatenate([uv, whitening], axis=1)[order].T
         hands = np.concatenate([T[:, :3, :3].reshape(-1, 9), T[:, :3, 3]], axis=1)[order].T
-        return cls(
-            np.ascontiguousarray(pixels),
-            np.ascontiguousarray(hands),
-            _blocks(who[order]),
-            order,
-            count,
+        spots = Spots(
+            np.ascontiguousarray(pixels), np.ascontiguousarray(hands), _blocks(who[order])
         )
+        return cls(spots, order, count)
 
     def __len__(self) -> int:
         return self.size
@@ -123,17 +104,18 @@ class SpotBatch:
         keep = weight > 0
         if not keep.any():
             raise FactorError("weights: every spot has weight zero")
-        who = np.repeat(self.blocks[:, :3], self.blocks[:, 4] - self.blocks[:, 3], axis=0)
-        pixels = self.pixels[:, keep].copy()
+        blocks = self.spots.blocks
+        who = np.repeat(blocks[:, :3], blocks[:, 4] - blocks[:, 3], axis=0)
+        pixels = self.spots.pixels[:, keep]
         pixels[2:] *= np.sqrt(weight[keep])
-        hands = np.ascontiguousarray(self.hands[:, keep])
-        return SpotBatch(pixels, hands, _blocks(who[keep]), self.order[keep], self.size)
+        spots = Spots(pixels, np.ascontiguousarray(self.spots.hands[:, keep]), _blocks(who[keep]))
+        return SpotBatch(spots, self.order[keep], self.size)
 
     def scaled(self, scale: float) -> SpotBatch:
-        """The same spots with every pixel sigma multiplied by ``scale``."""
-        pixels = self.pixels.copy()
+        """Return the same spots with every pixel sigma multiplied by ``scale``."""
+        pixels = self.spots.pixels.copy()
         pixels[2:] /= scale
-        return SpotBatch(pixels, self.hands, self.blocks, self.order, self.size)
+        return SpotBatch(self.spots._replace(pixels=pixels), self.order, self.size)
 
     @cached_property
     def used(self) -> npt.NDArray[np.bool_]:
@@ -145,13 +127,13 @@ class SpotBatch:
     def residuals(self, state: State) -> Array:
         """Predicted minus seen pixel in input order, (N, 2); NaN where impossible or left out."""
         out = np.full((self.size, 2), np.nan)
-        out[self.order] = kernels.residuals(self.pixels, self.hands, self.blocks, *state)
+        out[self.order] = kernels.residuals(self.spots, state)
         return out
 
     def whitened_lengths(self, state: State) -> Array:
         """Length of each whitened residual (sigmas), input order, (N,); NaN as in `residuals`."""
-        du, dv = kernels.residuals(self.pixels, self.hands, self.blocks, *state).T
-        w00, w01, w11 = self.pixels[2:]
+        du, dv = kernels.residuals(self.spots, state).T
+        w00, w01, w11 = self.spots.pixels[2:]
         out = np.full(self.size, np.nan)
         out[self.order] = np.hypot(w00 * du + w01 * dv, w11 * dv)
         return out
@@ -159,16 +141,12 @@ class SpotBatch:
     def rows(self, state: State) -> Array:
         """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
         out = np.full((self.size, 2, kernels.COLUMNS), np.nan)
-        out[self.order] = kernels.rows(self.pixels, self.hands, self.blocks, *state)
+        out[self.order] = kernels.rows(self.spots, state)
         return out
 
     def total_loss(self, state: State, loss: Loss) -> float:
         """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
-        return float(
-            kernels.total_loss(
-                self.pixels, self.hands, self.blocks, *state, LOSSES[loss.name], loss.threshold
-            )
-        )
+        return float(kernels.total_loss(self.spots, state, LOSSES[loss.name], loss.threshold))
 
 
 def _blocks(who: Index) -> Index:

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lasercal_factors import chart_kernels
-from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Array, Loss, SpotBatch, State
+from lasercal_factors.arrays import Array, State
+from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch
 from lasercal_factors.errors import FactorError
 from lasercal_factors.wrap import custom_factor
 
@@ -56,7 +57,8 @@ class CellChart:
 
     def state(self, z: Array) -> State:
         """The state at ``z``."""
-        return State(*chart_kernels.move(z, self.aspect_array, *self.reference))
+        state: State = chart_kernels.move(z, self.aspect_array, self.reference)
+        return state
 
     def tangent_map(self, z: Array) -> Array:
         """(n, n): a step in ``z`` to the step in the tangent coordinates of the state at ``z``.
@@ -104,7 +106,7 @@ def LaserCellFactor(
     loss = loss or Loss()
     reference, n = chart.reference, chart.n
     parts = np.array([len(reference.cam_R), len(reference.beam_l), len(reference.plane_d)])
-    most = batch.blocks[:, :3].max(axis=0)
+    most = batch.spots.blocks[:, :3].max(axis=0)
     if np.any(most >= parts):
         raise FactorError(f"batch: indices up to {most}, the chart has {parts} parts")
     mask = np.zeros(n, np.bool_) if held is None else np.array(held, np.bool_)
@@ -113,13 +115,13 @@ def LaserCellFactor(
     tied = np.flatnonzero(~np.isnan(chart.aspect_array))
     tie_from = CAMERA_DIM * tied + 6
     mask[tie_from] = True
-    c, l, p = batch.blocks[:, :3].T  # noqa: E741
+    c, l, p = batch.spots.blocks[:, :3].T  # noqa: E741
     laser = CAMERA_DIM * parts[0] + BEAM_DIM * l
     plane = CAMERA_DIM * parts[0] + BEAM_DIM * parts[1] + PLANE_DIM * p
     offsets = np.column_stack([CAMERA_DIM * c, CAMERA_DIM * c + 6, laser, plane])
-    about = (chart.aspect_array, *reference, batch.pixels, batch.hands, batch.blocks)
+    about = (chart.aspect_array, reference, batch.spots)
     robust = (LOSSES[loss.name], loss.threshold)
-    ties = (mask, tie_from, tie_from + 1, chart.aspect_array[tied])
+    constraints = (mask, tie_from, tie_from + 1, chart.aspect_array[tied])
 
     def error(values: Any) -> Array:
         e = np.zeros(n + 1)
@@ -128,7 +130,7 @@ def LaserCellFactor(
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         z = values.atVector(key)
-        R = chart_kernels.square_root_information_at(z, *about, offsets, *robust, *ties)
+        R = chart_kernels.square_root_information_at(z, *about, offsets, *robust, constraints)
         if not math.isfinite(R[0, 0]):
             raise FactorError("LaserCellFactor: " + IMPOSSIBLE)
         return R[:, n], [R[:, :n]]

@@ -1,6 +1,6 @@
 """Compiled arithmetic of the chart: a whole cell as one vector about a reference state.
 
-Arrays as in `kernels`; the coordinates ``z`` (n,) as in `chart.CellChart`.
+Arrays as in `arrays`; the coordinates ``z`` (n,) as in `chart.CellChart`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import math
 
 import numpy as np
 
+from lasercal_factors.arrays import State
 from lasercal_factors.kernels import (
     cholesky,
     constrain,
@@ -42,15 +43,17 @@ def rotation(w):
 
 
 @jit
-def move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
+def move(z, aspects, reference):
     """State at chart coordinates ``z`` (n,) about a reference state.
 
     A camera (15): ``R exp(w)``, ``t + R v``, intrinsics added; where ``aspects`` (C,) is a number,
     ``fu`` is that times ``fv``. A beam (4): added. A plane (3): the normal tilted along
     `tangent_basis` and normalised, the distance added.
     """
-    R, t, K = cam_R.copy(), cam_t.copy(), cam_K.copy()
-    line, normal, distance = beam_l.copy(), plane_n.copy(), plane_d.copy()
+    cam_R, plane_n = reference.cam_R, reference.plane_n
+    R, t, K = cam_R.copy(), reference.cam_t.copy(), reference.cam_K.copy()
+    line, normal = reference.beam_l.copy(), plane_n.copy()
+    distance = reference.plane_d.copy()
     at = 0
     for c in range(len(cam_R)):
         turn, _ = rotation(z[at : at + 3])
@@ -65,7 +68,7 @@ def move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane
         if not math.isnan(aspects[c]):
             K[c, 0] = aspects[c] * K[c, 1]
         at += 15
-    for m in range(len(beam_l)):
+    for m in range(len(line)):
         for j in range(4):
             line[m, j] += z[at + j]
         at += 4
@@ -76,7 +79,7 @@ def move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane
         normal[p] /= math.sqrt((normal[p] * normal[p]).sum())
         distance[p] += z[at + 2]
         at += 3
-    return R, t, K, beam_R, beam_t, line, normal, distance
+    return State(R, t, K, reference.beam_R, reference.beam_t, line, normal, distance)
 
 
 @jit
@@ -135,56 +138,19 @@ def transport(H, z, plane_n, moved_n, cameras, lasers):
 
 
 @jit
-def loss_at(
-    z,
-    aspects,
-    cam_R,
-    cam_t,
-    cam_K,
-    beam_R,
-    beam_t,
-    beam_l,
-    plane_n,
-    plane_d,
-    pixels,
-    hands,
-    blocks,
-    kind,
-    c_loss,
-):
+def loss_at(z, aspects, reference, spots, kind, c_loss):
     """`total_loss` at chart coordinates ``z``."""
-    state = move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d)
-    return total_loss(pixels, hands, blocks, *state, kind, c_loss)
+    return total_loss(spots, move(z, aspects, reference), kind, c_loss)
 
 
 @jit
-def square_root_information_at(
-    z,
-    aspects,
-    cam_R,
-    cam_t,
-    cam_K,
-    beam_R,
-    beam_t,
-    beam_l,
-    plane_n,
-    plane_d,
-    pixels,
-    hands,
-    blocks,
-    offsets,
-    kind,
-    c_loss,
-    held,
-    tie_from,
-    tie_to,
-    tie_ratio,
-):
+def square_root_information_at(z, aspects, reference, spots, offsets, kind, c_loss, constraints):
     """`square_root_information` in chart coordinates, at ``z``."""
-    state = move(z, aspects, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d)
-    H = information(pixels, hands, blocks, offsets, len(z), *state, kind, c_loss)
+    state = move(z, aspects, reference)
+    H = information(spots, offsets, len(z), state, kind, c_loss)
     if not math.isfinite(H[0, 0]):
         return H
-    transport(H, z, plane_n, state[6], len(cam_R), len(beam_l))
+    transport(H, z, reference.plane_n, state.plane_n, len(state.cam_R), len(state.beam_l))
+    held, tie_from, tie_to, tie_ratio = constraints
     constrain(H, held, tie_from, tie_to, tie_ratio)
     return cholesky(H)

@@ -5,19 +5,7 @@ Raw float64 arrays in SI units and pixels; no objects. Every function sees the s
 depends on are the same for the whole block. Spots are stored along the last axis, so that the loops
 run several spots at a time in the processor's vector units.
 
-Arrays of a batch
------------------
-pixels (5, N): seen pixel ``u, v`` and ``w00, w01, w11`` of the upper triangle ``W`` with
-``W.T @ W = inv(cov_uv)``
-hands (12, N): ``T_base_hand``, the rotation row by row (9), then the translation (3)
-blocks (M, 5): camera, laser, plane index, first spot, one past the last spot
-
-Arrays of a state (C cameras, L lasers, P planes)
--------------------------------------------------
-cam_R (C, 3, 3), cam_t (C, 3): ``T_base_camera``; cam_K (C, 9): ``fu fv skew u0 v0 k1 k2 p1 p2``
-beam_R (L, 3, 3), beam_t (L, 3), beam_l (L, 4): constant frame and ``a, b, x, y``: the beam runs
-along ``beam_R (a, b, 1)`` through ``beam_t + beam_R (x, y, 0)``, in hand coordinates
-plane_n (P, 3), plane_d (P,): ``n . x = d``
+Arrays are bundled as `arrays.Spots` and `arrays.State`.
 
 Columns of a spot's rows: camera pose 6 (rotation first, camera frame, as `gtsam.Pose3`), intrinsics
 9, beam 4, plane 3 (normal 2 along `tangent_basis`, then the offset as GTSAM stores it, ``-d``), and
@@ -106,6 +94,18 @@ def tangent_basis(n):
     return B
 
 
+@jit
+def _path(block, state):
+    """What all spots of a block share: beam, plane and camera (see `_fill_panel`)."""
+    c, l, p = block[0], block[1], block[2]  # noqa: E741
+    u, q = _beam_in_hand(state.beam_R[l], state.beam_t[l], state.beam_l[l])
+    n = state.plane_n[p]
+    return (
+        u, q, state.beam_R[l], n, state.plane_d[p], tangent_basis(n),
+        state.cam_R[c], state.cam_t[c], state.cam_K[c],
+    )  # fmt: skip
+
+
 @_inline
 def _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d):
     """Beam in base and its hit on the plane (8), (9): direction, spot, 1/(n.u), length."""
@@ -142,8 +142,9 @@ def _impossible(s, z, r2, k1, k2):
 
 
 @_jit_fast
-def _panel_residuals(pixels, hands, base, count, u, q, n, d, R, t, K, out):
+def _panel_residuals(pixels, hands, base, count, path, out):
     """Fill ``out`` (3, count): predicted minus seen pixel, and 1.0 where impossible."""
+    u, q, _, n, d, _, R, t, K = path
     u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
@@ -176,12 +177,13 @@ def _panel_loss(pixels, base, count, r, kind, c_loss):
 
 
 @_inline
-def _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q):
+def _fill_panel(pixels, hands, base, count, path, Q):
     """Whitened rows of spots base ... base+count-1 as columns of ``Q`` (24, 2 _PANEL).
 
     Column i holds the u row of spot base+i, column _PANEL+i its v row. Returns the number of
     impossible spots. Inlined, so that the compiler sees the constant shape of ``Q``.
     """
+    u, q, Rl, n, d, B, R, t, K = path
     u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
     r00, r01, r02, r10, r11, r12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
     r20, r21, r22, t0, t1, t2 = R[2, 0], R[2, 1], R[2, 2], t[0], t[1], t[2]
@@ -296,13 +298,13 @@ def _add_products(Q, count, S):
 
 
 @_jit_fast
-def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, kind, c_loss, S):
+def _block_information(pixels, hands, first, last, path, kind, c_loss, S):
     """Add ``[J r]^T [J r]`` of one block to ``S`` (24, 24); returns the impossible spots."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
     bad = 0.0
     for base in range(first, last, _PANEL):
         count = min(_PANEL, last - base)
-        bad += _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q)
+        bad += _fill_panel(pixels, hands, base, count, path, Q)
         if kind != LOSS_NONE:
             for i in range(count):
                 e0, e1 = Q[22, i], Q[22, _PANEL + i]
@@ -315,12 +317,12 @@ def _block_information(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, k
 
 
 @_jit_fast
-def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):
+def _block_rows(pixels, hands, first, last, path, out):
     """Fill ``out`` (N, 2, 23) with the rows of one block."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
     for base in range(first, last, _PANEL):
         count = min(_PANEL, last - base)
-        _fill_panel(pixels, hands, base, count, u, q, Rl, n, d, B, R, t, K, Q)
+        _fill_panel(pixels, hands, base, count, path, Q)
         for i in range(count):
             for j in range(COLUMNS):
                 out[base + i, 0, j] = Q[j, i]
@@ -328,121 +330,46 @@ def _block_rows(pixels, hands, first, last, u, q, Rl, n, d, B, R, t, K, out):
 
 
 @jit
-def residuals(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
+def residuals(spots, state):
     """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
-    out = np.empty((pixels.shape[1], 2))
-    for m in range(len(blocks)):
-        c, l, p, first, last = blocks[m]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        r = np.empty((3, last - first))
-        _panel_residuals(
-            pixels,
-            hands,
-            first,
-            last - first,
-            u,
-            q,
-            plane_n[p],
-            plane_d[p],
-            cam_R[c],
-            cam_t[c],
-            cam_K[c],
-            r,
-        )
-        for i in range(last - first):
+    out = np.empty((spots.pixels.shape[1], 2))
+    for block in spots.blocks:
+        first, count = block[3], block[4] - block[3]
+        r = np.empty((3, count))
+        _panel_residuals(spots.pixels, spots.hands, first, count, _path(block, state), r)
+        for i in range(count):
             for j in range(2):
                 out[first + i, j] = r[j, i] if r[2, i] == 0.0 else np.nan
     return out
 
 
 @jit
-def total_loss(
-    pixels,
-    hands,
-    blocks,
-    cam_R,
-    cam_t,
-    cam_K,
-    beam_R,
-    beam_t,
-    beam_l,
-    plane_n,
-    plane_d,
-    kind,
-    c_loss,
-):
+def total_loss(spots, state, kind, c_loss):
     """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
     r = np.empty((3, _PANEL))
     total, bad = 0.0, 0.0
-    for m in range(len(blocks)):
-        c, l, p, first, last = blocks[m]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        for base in range(first, last, _PANEL):
-            count = min(_PANEL, last - base)
-            _panel_residuals(
-                pixels,
-                hands,
-                base,
-                count,
-                u,
-                q,
-                plane_n[p],
-                plane_d[p],
-                cam_R[c],
-                cam_t[c],
-                cam_K[c],
-                r,
-            )
-            panel_total, panel_bad = _panel_loss(pixels, base, count, r, kind, c_loss)
+    for block in spots.blocks:
+        path = _path(block, state)
+        for base in range(block[3], block[4], _PANEL):
+            count = min(_PANEL, block[4] - base)
+            _panel_residuals(spots.pixels, spots.hands, base, count, path, r)
+            panel_total, panel_bad = _panel_loss(spots.pixels, base, count, r, kind, c_loss)
             total += panel_total
             bad += panel_bad
     return total if bad == 0.0 and math.isfinite(total) else np.inf
 
 
 @jit
-def rows(pixels, hands, blocks, cam_R, cam_t, cam_K, beam_R, beam_t, beam_l, plane_n, plane_d):
+def rows(spots, state):
     """Whitened Jacobian and residual of every spot, (N, 2, 23), possible or not."""
-    out = np.empty((pixels.shape[1], 2, COLUMNS))
-    for m in range(len(blocks)):
-        c, l, p, first, last = blocks[m]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
-        _block_rows(
-            pixels,
-            hands,
-            first,
-            last,
-            u,
-            q,
-            beam_R[l],
-            plane_n[p],
-            plane_d[p],
-            tangent_basis(plane_n[p]),
-            cam_R[c],
-            cam_t[c],
-            cam_K[c],
-            out,
-        )
+    out = np.empty((spots.pixels.shape[1], 2, COLUMNS))
+    for block in spots.blocks:
+        _block_rows(spots.pixels, spots.hands, block[3], block[4], _path(block, state), out)
     return out
 
 
 @jit
-def information(
-    pixels,
-    hands,
-    blocks,
-    offsets,
-    n,
-    cam_R,
-    cam_t,
-    cam_K,
-    beam_R,
-    beam_t,
-    beam_l,
-    plane_n,
-    plane_d,
-    kind,
-    c_loss,
-):
+def information(spots, offsets, n, state, kind, c_loss):
     """Augmented information ``[J r]^T [J r]``, (n+1, n+1); [0, 0] NaN if a spot cannot be.
 
     ``offsets`` (M, 4): first global column of camera pose, intrinsics, beam and plane of a block.
@@ -451,27 +378,11 @@ def information(
     S = np.empty((_PADDED, _PADDED))
     column = np.empty(COLUMNS, np.int64)
     bad = 0.0
-    for m in range(len(blocks)):
-        c, l, p, first, last = blocks[m]  # noqa: E741
-        u, q = _beam_in_hand(beam_R[l], beam_t[l], beam_l[l])
+    for m in range(len(spots.blocks)):
+        block = spots.blocks[m]
         S[:] = 0.0
         bad += _block_information(
-            pixels,
-            hands,
-            first,
-            last,
-            u,
-            q,
-            beam_R[l],
-            plane_n[p],
-            plane_d[p],
-            tangent_basis(plane_n[p]),
-            cam_R[c],
-            cam_t[c],
-            cam_K[c],
-            kind,
-            c_loss,
-            S,
+            spots.pixels, spots.hands, block[3], block[4], _path(block, state), kind, c_loss, S
         )
         for i in range(6):
             column[i] = offsets[m, 0] + i
@@ -537,49 +448,14 @@ def cholesky(H):
 
 
 @jit
-def square_root_information(
-    pixels,
-    hands,
-    blocks,
-    offsets,
-    n,
-    cam_R,
-    cam_t,
-    cam_K,
-    beam_R,
-    beam_t,
-    beam_l,
-    plane_n,
-    plane_d,
-    kind,
-    c_loss,
-    held,
-    tie_from,
-    tie_to,
-    tie_ratio,
-):
+def square_root_information(spots, offsets, n, state, kind, c_loss, constraints):
     """`information`, `constrain` and `cholesky` in one go: ``R`` (n+1, n+1), last column residual.
 
-    [0, 0] is NaN where a spot cannot be.
+    ``constraints``: the arguments of `constrain`. [0, 0] is NaN where a spot cannot be.
     """
-    H = information(
-        pixels,
-        hands,
-        blocks,
-        offsets,
-        n,
-        cam_R,
-        cam_t,
-        cam_K,
-        beam_R,
-        beam_t,
-        beam_l,
-        plane_n,
-        plane_d,
-        kind,
-        c_loss,
-    )
+    H = information(spots, offsets, n, state, kind, c_loss)
     if not math.isfinite(H[0, 0]):
         return H
+    held, tie_from, tie_to, tie_ratio = constraints
     constrain(H, held, tie_from, tie_to, tie_ratio)
     return cholesky(H)

@@ -24,7 +24,8 @@ import numpy as np
 import numpy.typing as npt
 
 from lasercal_factors import kernels
-from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Array, Index, Loss, SpotBatch, State
+from lasercal_factors.arrays import Array, Index, State
+from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch
 from lasercal_factors.beam import BeamFrame
 from lasercal_factors.errors import FactorError
 from lasercal_factors.wrap import custom_factor
@@ -93,7 +94,7 @@ class CellKeys:
     def offsets(self, batch: SpotBatch) -> Index:
         """(M, 4) first columns of camera pose, intrinsics, beam and plane for each block."""
         first = np.array([c.start for c in self.columns], dtype=np.int64)
-        c, l, p = batch.blocks[:, :3].T  # noqa: E741
+        c, l, p = batch.spots.blocks[:, :3].T  # noqa: E741
         laser = 2 * len(self.cameras) + l
         plane = 2 * len(self.cameras) + len(self.lasers) + p
         which: Index = np.column_stack([2 * c, 2 * c + 1, laser, plane])
@@ -136,7 +137,7 @@ def LaserSpotFactor(
     batch = SpotBatch.from_arrays(
         np.asarray(uv)[None], np.asarray(cov_uv)[None], np.asarray(T_base_hand)[None], [0], [0], [0]
     )
-    w00, w01, w11 = batch.pixels[2:, 0]
+    w00, w01, w11 = batch.spots.pixels[2:, 0]
 
     def error(values: Any) -> Array:
         du, dv = batch.residuals(keys.read(values))[0]
@@ -182,15 +183,17 @@ def LaserSpotBatchFactor(
     """
     loss = loss or Loss()
     limits = (len(keys.cameras), len(keys.lasers), len(keys.planes))
-    if np.any(batch.blocks[:, :3].max(axis=0) >= limits):
-        raise FactorError(f"batch: indices up to {batch.blocks[:, :3].max(axis=0)}, keys {limits}")
+    if np.any(batch.spots.blocks[:, :3].max(axis=0) >= limits):
+        raise FactorError(
+            f"batch: indices up to {batch.spots.blocks[:, :3].max(axis=0)}, keys {limits}"
+        )
     n = keys.n
     mask = np.zeros(n, np.bool_) if held is None else np.array(held, np.bool_)
     if mask.shape != (n,):
         raise FactorError(f"held: expected ({n},) booleans, got {mask.shape}")
     none = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
-    spots = (batch.pixels, batch.hands, batch.blocks, keys.offsets(batch), n)
-    rest = (LOSSES[loss.name], loss.threshold, mask, *none)
+    spots, offsets = batch.spots, keys.offsets(batch)
+    rest = (LOSSES[loss.name], loss.threshold, (mask, *none))
     noise = gtsam.noiseModel.Unit.Create(n + 1)
     columns = keys.columns
 
@@ -200,7 +203,7 @@ def LaserSpotBatchFactor(
         return e
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
-        R = kernels.square_root_information(*spots, *keys.read(values), *rest)
+        R = kernels.square_root_information(spots, offsets, n, keys.read(values), *rest)
         if not math.isfinite(R[0, 0]):
             raise FactorError("LaserSpotBatchFactor: " + IMPOSSIBLE)
         return R[:, n], [R[:, c] for c in columns]
