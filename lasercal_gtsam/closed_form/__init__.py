@@ -20,7 +20,8 @@ camera from points and planes                `camera`                    -
 parts that no pair gives alone               `complete`                  (9), (12), (14)
 what the data must hold                      `requirements`              ranks of (27), (30), (53)
 rank and weight of the whole                 `information`               residual (55)
-order of the stages, ranking                 `pair`, `candidates`        -
+order of the stages, outliers, ranking       `pair`, `outliers`,         -
+                                             `candidates`
 ===========================================  ==========================  =========================
 
 Lengths are metres, angles radians; ``xy`` are pixels scaled by `spots.pixel_scaling`.

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.closed_form.camera import KnownIntrinsics
 from lasercal_gtsam.closed_form.complete import complete_cell, is_complete
-from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, find_groups, thinned
+from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, thinned
 from lasercal_gtsam.closed_form.information import check_information
-from lasercal_gtsam.closed_form.pair import PairCandidate, solve_pair
+from lasercal_gtsam.closed_form.outliers import set_aside, solve_pair_without_outliers
+from lasercal_gtsam.closed_form.pair import PairCandidate
 from lasercal_gtsam.closed_form.solution import NEGATIVE_DEPTH_PENALTY_PX, cell_reprojection
 from lasercal_gtsam.closed_form.spots import Spots, pairs_of, pixel_scaling
 from lasercal_gtsam.errors import DegenerateError
@@ -26,15 +29,17 @@ class Candidate:
     Attributes
     ----------
     cell : cameras (without distortion), lasers and planes; complete
-    rms_px : root mean square distance over all spots, pixels
+    rms_px : root mean square distance over the spots that were used, pixels
     method : how it was found, for the log
     negative_depths : fraction of spots behind the camera or behind the laser
+    set_aside : labels of spots far off from the best start, which none of the starts used
     """
 
     cell: Cell
     rms_px: float
     method: str
     negative_depths: float
+    set_aside: tuple[str, ...] = ()
 
     @property
     def rank(self) -> float:
@@ -101,7 +106,7 @@ def closed_form_candidates(
         everything = Spots.of_pair(observations, camera, laser)
         spots = thinned(everything, tolerance_rad=group_tolerance_rad)
         try:
-            found = solve_pair(spots, find_groups(spots, group_tolerance_rad), known[camera])
+            found = solve_pair_without_outliers(spots, known[camera], group_tolerance_rad)
         except DegenerateError as error:
             reasons.append(f"camera {camera!r} with laser {laser!r}: {error}")
             continue
@@ -109,6 +114,12 @@ def closed_form_candidates(
     if not pairs:
         raise DegenerateError("\n".join(reasons) or "there are no spots")
     pairs.sort(key=lambda pair: len(pair.spots))
+    used = np.ones(len(observations), dtype=bool)
+    for pair in pairs:
+        used[pair.spots.rows[set_aside(pair.found[0].solution, pair.spots)]] = False
+    aside = tuple(str(name) for name in observations.id[~used])
+    if aside:
+        observations = observations[used]
     candidates: list[Candidate] = []
     refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
@@ -125,7 +136,7 @@ def closed_form_candidates(
                 refusal = error
                 continue
         rms, negative = cell_reprojection(cell, observations)
-        candidates.append(Candidate(cell, rms, chosen[-1].method, negative))
+        candidates.append(Candidate(cell, rms, chosen[-1].method, negative, aside))
     if not candidates and refusal:
         raise refusal
     candidates.sort(key=lambda candidate: candidate.rank)

@@ -26,7 +26,6 @@ SMALLEST_INFORMATION = 1e-7
 WORST_FOCAL_SIGMA = 3.0
 """Relative sigma beyond which a focal length counts as not given by the data."""
 PARALLEL_RAD = 5.0 * RAD_PER_DEG
-_MOST_SPOTS = 2000
 _SHARE = 0.01
 
 Columns = dict[tuple[str, int], Array]
@@ -127,9 +126,6 @@ def check_information(
         together without moving a spot, and what would tell them apart. Or a focal length would have
         a sigma of more than `WORST_FOCAL_SIGMA` times itself.
     """
-    step = -(-len(observations) // _MOST_SPOTS)
-    if step > 1:
-        observations = observations[::step]
     blocks: list[Columns] = []
     for camera, laser in pairs_of(observations):
         spots = Spots.of_pair(observations, camera, laser)
@@ -158,7 +154,8 @@ def check_information(
     if not np.isfinite(J).all():
         return
     scale = np.linalg.norm(J, axis=0)
-    _, s, Vt = np.linalg.svd(J / np.where(scale > 0, scale, 1.0), full_matrices=len(J) < len(names))
+    R = np.linalg.qr(J / np.where(scale > 0, scale, 1.0), mode="r")
+    _, s, Vt = np.linalg.svd(R, full_matrices=True)
     rank = int((s > SMALLEST_INFORMATION * s[0]).sum())
     if rank == len(names):
         noise = min(rms_px / np.sqrt(2.0), 1.0)

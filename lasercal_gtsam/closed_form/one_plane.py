@@ -28,12 +28,10 @@ from lasercal_gtsam.closed_form.groups import Groups
 from lasercal_gtsam.closed_form.linear import null_vector
 from lasercal_gtsam.closed_form.solution import Solution
 from lasercal_gtsam.closed_form.spots import Index, Spots
+from lasercal_gtsam.closed_form.triangulation import SMALLEST_BEAM_SPREAD_RAD
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.rotations import basis_of, skew
-from lasercal_gtsam.units import RAD_PER_DEG
-
-SMALLEST_BEAM_SPREAD_RAD = 0.25 * RAD_PER_DEG
 
 
 def translation_images(groups: PlaneGroups) -> Array:

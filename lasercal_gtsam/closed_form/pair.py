@@ -25,7 +25,7 @@ from lasercal_gtsam.closed_form.direction import robust_directions
 from lasercal_gtsam.closed_form.general import solve_general
 from lasercal_gtsam.closed_form.groups import Groups
 from lasercal_gtsam.closed_form.one_plane import solve_one_plane
-from lasercal_gtsam.closed_form.requirements import check_spots
+from lasercal_gtsam.closed_form.requirements import check_spots, planes_seen_flat
 from lasercal_gtsam.closed_form.search import search_beams
 from lasercal_gtsam.closed_form.solution import (
     NEGATIVE_DEPTH_PENALTY_PX,
@@ -78,7 +78,9 @@ def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[Pai
         The poses cannot determine the cell, or no stage gave a solution.
     """
     check_spots(spots)
-    planes = scaled_planes(spots)
+    flat = planes_seen_flat(spots)
+    groups = groups.subset(np.flatnonzero(~np.isin(groups.plane, flat)))
+    planes = [plane for plane in scaled_planes(spots) if plane.index not in flat]
     directions, _ = robust_directions(groups)
     reasons: list[str] = []
     found = _ranked(solutions_from_groups(spots, groups, directions, known, reasons), spots)

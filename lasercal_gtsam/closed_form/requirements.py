@@ -21,6 +21,8 @@ DISTINCT_ORIENTATION_RAD = 0.5 * RAD_PER_DEG
 SMALLEST_TURN_RAD = 0.25 * RAD_PER_DEG
 """Rms turn about an axis below which the hand counts as not turned about it."""
 SMALLEST_MOTION_M = 1e-4
+FLATTEST_IMAGE = 5e-3
+"""Pixels of a plane that spread less across a line than this share of its length lie on it."""
 _THREE = (
     "three or more hand orientations are needed, turned by 20 deg or more about two axes or more"
 )
@@ -41,8 +43,8 @@ def check_spots(spots: Spots) -> None:
     Raises
     ------
     DegenerateError
-        Too few spots, too few hand orientations or all about one axis, or no translation; the
-        message says what is missing and what would supply it.
+        Too few spots, pixels in one line, too few hand orientations or all about one axis, or no
+        translation; the message says what is missing and what would supply it.
     """
     needed = spots_needed(spots.plane_count)
     if len(spots) < needed:
@@ -50,8 +52,24 @@ def check_spots(spots: Spots) -> None:
             f"{len(spots)} spots on {_planes(spots.plane_count)} are too few: at least {needed} "
             "are needed, and 30 or more are advisable; add shots"
         )
+    if len(planes_seen_flat(spots)) == spots.plane_count:
+        raise DegenerateError(
+            "the pixels of every plane lie on one line (or in one point): move the spots over the "
+            "image in two directions"
+        )
     check_orientations(spots.R)
     check_translations(spots.R, spots.t)
+
+
+def planes_seen_flat(spots: Spots) -> list[int]:
+    """Planes whose pixels lie on one line: they give no map from the image to the plane."""
+    flat = []
+    for p in range(spots.plane_count):
+        xy = spots.xy[spots.on_plane(p)]
+        s = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+        if len(xy) < 3 or s[1] <= FLATTEST_IMAGE * s[0]:
+            flat.append(p)
+    return flat
 
 
 def check_orientations(R: Array) -> None:

@@ -13,7 +13,11 @@ import numpy as np
 
 from lasercal_gtsam.closed_form.beam_fit import refine_beam
 from lasercal_gtsam.closed_form.direction import best_distinct_index, hemisphere
-from lasercal_gtsam.closed_form.triangulation import DISTINCT_BEAMS_RAD, PlaneSpots, solvable_planes
+from lasercal_gtsam.closed_form.triangulation import (
+    SMALLEST_BEAM_SPREAD_RAD,
+    PlaneSpots,
+    solvable_planes,
+)
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.units import RAD_PER_DEG
@@ -87,7 +91,7 @@ def search_beams(planes: list[PlaneSpots], keep: int = 4) -> list[tuple[Array, A
         The planes with two hand orientations or more have too few spots: fewer equations than
         unknowns (11 a plane and 4 of the beam).
     """
-    planes = [plane for plane in planes if _orientation_spread(plane) > DISTINCT_BEAMS_RAD]
+    planes = [plane for plane in planes if _orientation_spread(plane) > SMALLEST_BEAM_SPREAD_RAD]
     surplus = sum(2 * len(plane) - 11 for plane in planes)
     if surplus < 4:
         raise DegenerateError(

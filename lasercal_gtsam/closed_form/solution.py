@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
 from lasercal_gtsam.closed_form.spots import Spots, pairs_of
@@ -101,24 +102,39 @@ def spots_on_beams(solution: Solution, spots: Spots) -> tuple[Array, Array]:
         return q + length[:, None] * u, np.asarray(length)
 
 
+def spot_distances(solution: Solution, spots: Spots) -> Array:
+    """Distance of every spot from its prediction: (N,) pixels.
+
+    Infinite behind the camera or the beam, NaN on planes that are not solved.
+    """
+    error, behind = _pixel_errors(solution, spots)
+    distance = np.sqrt((error**2).sum(axis=1))
+    unsolved = ~np.isfinite(solution.normals[spots.plane]).all(axis=1)
+    return np.where(unsolved, np.nan, np.where(behind | np.isnan(distance), np.inf, distance))
+
+
 def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
     """Root mean square distance in pixels and fraction of spots behind camera or beam.
 
     Spots on unsolved planes do not count. A spot behind the camera is projected all the same, so
     that the first number stays comparable.
     """
+    error, behind = _pixel_errors(solution, spots)
+    counted = np.isfinite(solution.normals[spots.plane]).all(axis=1)
+    if not counted.any():
+        return np.inf, 1.0
+    mean = (error[counted] ** 2).sum(axis=1).mean()
+    return float(np.sqrt(mean)) if np.isfinite(mean) else np.inf, float(behind[counted].mean())
+
+
+def _pixel_errors(solution: Solution, spots: Spots) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Predicted minus seen pixels (N, 2), and which spots lie behind camera or beam (N,)."""
     X, length = spots_on_beams(solution, spots)
     p = (X - solution.T) @ solution.R
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         image = p @ (spots.scaling @ solution.K).T
         error = (image[:, :2] / image[:, 2:] - spots.xy) / spots.scaling[0, 0]
-        squared = (error**2).sum(axis=1)
-    counted = np.isfinite(solution.normals[spots.plane]).all(axis=1)
-    if not counted.any():
-        return np.inf, 1.0
-    negative = ~((p[:, 2] > 0) & (length > 0))
-    mean = squared[counted].mean()
-    return float(np.sqrt(mean)) if np.isfinite(mean) else np.inf, float(negative[counted].mean())
+    return np.asarray(error), ~((p[:, 2] > 0) & (length > 0))
 
 
 def cell_reprojection(cell: Cell, observations: Observations) -> tuple[float, float]:

@@ -23,6 +23,7 @@ class Spots:
 
     Attributes
     ----------
+    rows : (N,) indices of the spots in the observations
     xy : (N, 2) pixels after `pixel_scaling` (image centre 0, half diagonal sqrt(2))
     R, t : (N, 3, 3), (N, 3); hand poses ``p_base = R p_hand + t``, metres
     plane : (N,) index into ``plane_names``
@@ -31,6 +32,7 @@ class Spots:
     image_size : (width, height), pixels
     """
 
+    rows: Index
     xy: Array
     R: Array
     t: Array
@@ -42,13 +44,14 @@ class Spots:
     @classmethod
     def of_pair(cls, observations: Observations, camera: str, laser: str) -> Spots:
         """Pick the spots which ``laser`` lit and ``camera`` saw."""
-        chosen = (observations.camera == camera) & (observations.laser == laser)
+        chosen = np.flatnonzero((observations.camera == camera) & (observations.laser == laser))
         index = observations.plane_index[chosen]
         used, plane = np.unique(index, return_inverse=True)
         size = observations.image_size[camera]
         scaling = pixel_scaling(size)
         poses = observations.T_base_hand[chosen]
         return cls(
+            rows=chosen,
             xy=transformed(scaling, observations.uv[chosen]),
             R=poses[:, :3, :3],
             t=poses[:, :3, 3],
@@ -64,7 +67,12 @@ class Spots:
     def subset(self, rows: Index) -> Spots:
         """Select spots by index; the planes stay numbered as they are."""
         return replace(
-            self, xy=self.xy[rows], R=self.R[rows], t=self.t[rows], plane=self.plane[rows]
+            self,
+            rows=self.rows[rows],
+            xy=self.xy[rows],
+            R=self.R[rows],
+            t=self.t[rows],
+            plane=self.plane[rows],
         )
 
     @property

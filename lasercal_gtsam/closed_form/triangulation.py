@@ -27,8 +27,8 @@ from lasercal_gtsam.rotations import basis_of
 from lasercal_gtsam.units import RAD_PER_DEG
 
 SPOTS_FOR_REDUCED = 6
-DISTINCT_BEAMS_RAD = 0.5 * RAD_PER_DEG
-"""Beams of one plane that differ by less count as parallel."""
+SMALLEST_BEAM_SPREAD_RAD = 0.25 * RAD_PER_DEG
+"""Rms angle of beams about their mean below which they count as parallel."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +118,7 @@ def beam_spread(plane: PlaneSpots, u: Array) -> float:
 
 def solvable_planes(planes: list[PlaneSpots], u: Array) -> list[PlaneSpots]:
     """The planes whose beams have at least two directions."""
-    return [plane for plane in planes if beam_spread(plane, u) > 0.25 * DISTINCT_BEAMS_RAD]
+    return [plane for plane in planes if beam_spread(plane, u) > SMALLEST_BEAM_SPREAD_RAD]
 
 
 def reduced_system(plane: PlaneSpots, E: Array, tau: Array) -> Array:

@@ -27,6 +27,7 @@ from lasercal_gtsam.closed_form.requirements import (
 )
 from lasercal_gtsam.closed_form.solution import Solution
 from lasercal_gtsam.errors import DegenerateError
+from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.projection import project
 from lasercal_gtsam.rotations import basis_of, make_pose, rotation_exp
 from lasercal_gtsam.simulate import Noise
@@ -58,6 +59,15 @@ def test_too_few_spots():
     sim = exact()
     refused(sim.observations[:7], r"7 spots on 1 plane are too few: at least 8")
     refused(sim.observations[[0, 30, 60]], r"3 spots on 3 planes are too few: at least 12")
+
+
+def test_pixels_in_one_line():
+    observations = exact("paper-2").observations
+    for uv in (observations.uv * [1.0, 0.0] + [0.0, 99.0], np.full_like(observations.uv, 50.0)):
+        flat = Observations.from_arrays(
+            uv, observations.T_base_hand, plane=list(observations.plane), image_size=(640, 480)
+        )
+        refused(flat, "pixels of every plane lie on one line")
 
 
 def test_one_orientation():
@@ -293,3 +303,45 @@ def test_free_intrinsics():
     known = KnownIntrinsics(principal_point=(0.0, 0.0), skew=0.0, aspect=1.0)
     assert free_intrinsics(known, 3) == ("focal length",)
     assert free_intrinsics(KnownIntrinsics(focal_lengths=(1.0, 1.0), skew=0.0), 2) == ("u0", "v0")
+
+
+# --- garbage in, no traceback out ----------------------------------------------------------------
+
+
+def spoiled(kind: str, rng: np.random.Generator) -> Observations:
+    sim = exact(("paper", "paper-2", "paper-1", "no-groups")[rng.integers(4)], int(rng.integers(3)))
+    observations = sim.observations
+    uv, poses = observations.uv.copy(), observations.T_base_hand.copy()
+    plane, n = observations.plane.copy(), len(observations)
+    if kind == "random pixels":
+        uv = rng.uniform(0.0, 480.0, uv.shape)
+    elif kind == "far poses":
+        poses[:, :3, 3] = rng.normal(scale=10.0, size=(n, 3))
+    elif kind == "random rotations":
+        poses[:, :3, :3] = rotation_exp(rng.normal(scale=2.0, size=(n, 3)))
+    elif kind == "shuffled planes":
+        plane = rng.permutation(plane)
+    elif kind == "one pose":
+        first = plane == plane[0]
+        poses[first], uv[first] = poses[0], uv[0]
+    else:
+        chosen = rng.choice(n, rng.integers(8, 20), replace=False)
+        uv, poses, plane = uv[chosen], poses[chosen], plane[chosen]
+    return Observations.from_arrays(uv, poses, plane=list(plane), image_size=(640, 480))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["random pixels", "far poses", "random rotations", "shuffled planes", "one pose", "few spots"],
+)
+def test_garbage_is_refused_or_ranked_badly_but_never_crashes(kind):
+    rng = np.random.default_rng(11)
+    for _ in range(2):
+        try:
+            found = closed_form_candidates(spoiled(kind, rng))
+        except DegenerateError as refusal:
+            assert len(str(refusal)) > 40
+            continue
+        assert all(np.isfinite(candidate.rms_px) for candidate in found)
+        if kind != "few spots":
+            assert found[0].rank > 10.0

@@ -249,6 +249,7 @@ def test_camera_is_not_needed():
     sim = exact("no-groups")
     spots = spots_of(sim)
     other = type(spots)(
+        rows=spots.rows,
         xy=spots.xy @ np.array([[2.0, 0.1], [0.0, 0.7]]) + np.array([3.0, -1.0]),
         R=spots.R,
         t=spots.t,
