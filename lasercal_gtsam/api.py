@@ -20,7 +20,7 @@ from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
 from lasercal_gtsam.hand_noise import adjusted_batch
-from lasercal_gtsam.holds import resolve_holds
+from lasercal_gtsam.holds import Holds, resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.robust import reject_outliers
@@ -88,7 +88,7 @@ def calibrate(
         search, solution = _with_hand_noise(search, solution)
     reasons: tuple[str | None, ...] = (None,) * len(observations)
     if options.robust == "auto":
-        search, solution, reasons = reject_outliers(search, solution)
+        search, solution, reasons = _without_outliers(search, solution, holds)
     return assemble(observations, options, start, solution, batch, reasons)
 
 
@@ -163,6 +163,17 @@ def _fit(
         n_spots=len(residuals),
         n_rejected=n_rejected,
     )
+
+
+def _without_outliers(
+    search: Search, solution: Solution, wanted: Holds
+) -> tuple[Search, Solution, tuple[str | None, ...]]:
+    """Leave out outliers; distortion terms that had to be held because of them are freed again."""
+    kept, refit, reasons = reject_outliers(search, solution)
+    if not any(reasons) or np.array_equal(search.holds.held, wanted.held):
+        return kept, refit, reasons
+    again = refine_candidates(replace(kept, holds=wanted), [refit.cell])
+    return reject_outliers(replace(search, holds=again.problem.holds), again)
 
 
 def _with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Solution]:

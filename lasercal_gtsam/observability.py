@@ -52,9 +52,7 @@ class RangeSvd:
     labels: tuple[str, ...]
 
     @classmethod
-    def of(
-        cls, R: Array, labels: tuple[str, ...], free: npt.NDArray[np.bool_]
-    ) -> RangeSvd:
+    def of(cls, R: Array, labels: tuple[str, ...], free: npt.NDArray[np.bool_]) -> RangeSvd:
         """Decompose ``R`` (rows, n), information in sigmas, over the ``free`` (n,) columns."""
         names = tuple(label for label, is_free in zip(labels, free, strict=True) if is_free)
         ranges = plausible_ranges(names)
