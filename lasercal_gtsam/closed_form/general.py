@@ -167,7 +167,10 @@ def inverse_projection(groups: PlaneGroups) -> tuple[Array, float]:
             "two each on two planes that are not parallel, with different hand orientations"
         )
     if x[9:].min() <= 0 or np.linalg.det(G_inv) <= 0:
-        raise DegenerateError("the groups contradict each other (mirrored camera)")
+        raise DegenerateError(
+            "the groups contradict each other (they give a mirrored camera): two or three hand "
+            "orientations on each plane and longer translations make them firmer"
+        )
     return G_inv, gap
 
 

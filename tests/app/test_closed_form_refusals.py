@@ -92,7 +92,7 @@ def test_all_orientations_about_one_axis(level, planes):
     angles = np.random.default_rng(0).uniform(-0.5, 0.5, 60)
     observations = shots_at(cell, [R0 @ rotation_exp(AXIS * a) for a in angles], positions)
     message = refused(observations, "turn about one axis")
-    named = np.array(eval(message.split("axis (")[1].split(" in")[0]))
+    named = np.array([float(x) for x in message.split("axis (")[1].split(" in")[0].split(",")])
     assert abs(named @ AXIS) == pytest.approx(1.0, abs=1e-3)
     # rolls about the beam are the commonest case of it
     u, _ = beam_of(sim.truth)
