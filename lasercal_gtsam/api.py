@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from lasercal_factors.batch import Loss, SpotBatch
@@ -19,16 +21,17 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
-from lasercal_gtsam.hand_noise import adjusted_batch
+from lasercal_gtsam.hand_noise import with_hand_noise
 from lasercal_gtsam.holds import Holds, resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
-from lasercal_gtsam.robust import reject_outliers
+from lasercal_gtsam.robust import reject_outliers, without_outliers
 from lasercal_gtsam.solve import Solution, fold_warnings
 from lasercal_gtsam.start import Search, refine_candidates, refine_given
 from lasercal_gtsam.uncertainty import Uncertainty, estimate_uncertainty, table_parameters
 
-_HAND_ROUNDS = 4
+if TYPE_CHECKING:
+    from lasercal_gtsam.closed_form import Candidate
 
 
 def calibrate(
@@ -67,28 +70,24 @@ def calibrate(
     holds = resolve_holds(observations, options, initial)
     batch = make_batch(observations, options.sigma_px)
     search = Search(observations, batch, holds, options, Loss())
+    robust = options.robust == "auto"
     if initial is None:
-        from lasercal_gtsam.closed_form import closed_form_candidates
-
-        candidates = closed_form_candidates(
-            observations,
-            principal_point={
-                name: (known["u0"], known["v0"])
-                for name, known in holds.known.items()
-                if {"u0", "v0"} <= set(known)
-            },
-        )
+        candidates = _closed_form(observations, holds)
         start = holds.apply(candidates[0].cell)
-        solution = refine_candidates(search, [candidate.cell for candidate in candidates])
+        aside = np.isin(observations.id, candidates[0].set_aside) & robust
+        cells = [candidate.cell for candidate in candidates]
+        solution = refine_candidates(search.without(aside), cells)
     else:
         start = initial
         solution = refine_given(search, initial)
     search = replace(search, holds=solution.problem.holds)
-    if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
-        search, solution = _with_hand_noise(search, solution)
     reasons: tuple[str | None, ...] = (None,) * len(observations)
-    if options.robust == "auto":
-        search, solution, reasons = _without_outliers(search, solution, holds)
+    if robust:
+        search, solution, reasons = without_outliers(search, solution, holds)
+    if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
+        search, solution = with_hand_noise(search, solution)
+        if robust:
+            search, solution, reasons = reject_outliers(search, solution)
     return assemble(observations, options, start, solution, batch, reasons)
 
 
@@ -165,34 +164,18 @@ def _fit(
     )
 
 
-def _without_outliers(
-    search: Search, solution: Solution, wanted: Holds
-) -> tuple[Search, Solution, tuple[str | None, ...]]:
-    """Leave out outliers; distortion terms that had to be held because of them are freed again."""
-    kept, refit, reasons = reject_outliers(search, solution)
-    if not any(reasons) or np.array_equal(search.holds.held, wanted.held):
-        return kept, refit, reasons
-    again = refine_candidates(replace(kept, holds=wanted), [refit.cell])
-    return reject_outliers(replace(search, holds=again.problem.holds), again)
+def _closed_form(observations: Observations, holds: Holds) -> Sequence[Candidate]:
+    """Starts from the data alone, told what is known of the cameras."""
+    from lasercal_gtsam.closed_form import closed_form_candidates
 
-
-def _with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Solution]:
-    """Refit with the robot's noise: a few rounds of corrected hand poses (`hand_noise`)."""
-    observations, options = search.observations, search.options
-    unknown = np.isnan(observations.cov_uv[:, 0, 0])
-    own = (options.sigma_px or 1.0) ** 2 * np.eye(2)
-    cov = np.where(unknown[:, None, None], own, observations.cov_uv)
-    eta = np.zeros((len(observations), 6))
-    for _ in range(_HAND_ROUNDS):
-        batch, eta = adjusted_batch(
-            observations, cov, solution.cell, options.hand_sigma_m, options.hand_sigma_rad, eta
-        )
-        search = replace(search, batch=batch)
-        better = search.solve_from(solution.cell)
-        if better is None:
-            break
-        solution = replace(better, iterations=solution.iterations + better.iterations)
-    return search, solution
+    known = holds.known.items()
+    return closed_form_candidates(
+        observations,
+        principal_point={c: (k["u0"], k["v0"]) for c, k in known if {"u0", "v0"} <= set(k)},
+        skew={c: k["skew"] for c, k in known if "skew" in k},
+        aspect=holds.aspect,
+        focal_lengths={c: (k["fu"], k["fv"]) for c, k in known if {"fu", "fv"} <= set(k)},
+    )
 
 
 def _restricted(cell: Cell, like: Cell) -> Cell:

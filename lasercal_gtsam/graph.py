@@ -108,15 +108,20 @@ class CellGraph:
         return np.concatenate(parts, axis=1).T if parts else np.empty((0, 2))
 
 
-def make_batch(observations: Observations, sigma_px: float | None) -> SpotBatch:
-    """Spots for the factors; where a spot has no covariance of its own, ``sigma_px`` (or 1 px)."""
+def pixel_covariances(observations: Observations, sigma_px: float | None) -> Array:
+    """(N, 2, 2) px^2; where a spot has no covariance of its own, that of ``sigma_px`` (or 1 px)."""
     cov = observations.cov_uv
     unknown = np.isnan(cov[:, 0, 0])
-    if unknown.any():
-        cov = np.where(unknown[:, None, None], (sigma_px or 1.0) ** 2 * np.eye(2), cov)
+    if not unknown.any():
+        return cov
+    return np.where(unknown[:, None, None], (sigma_px or 1.0) ** 2 * np.eye(2), cov)
+
+
+def make_batch(observations: Observations, sigma_px: float | None) -> SpotBatch:
+    """Spots for the factors, whitened with `pixel_covariances`."""
     return SpotBatch.from_arrays(
         observations.uv,
-        cov,
+        pixel_covariances(observations, sigma_px),
         observations.T_base_hand,
         observations.camera_index,
         observations.laser_index,
@@ -235,7 +240,10 @@ def _prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFa
         return e
 
     def error(values: Any) -> Array:
-        return residual(cell_from_state(chart.state(values.atVector(CELL_KEY)), start))
+        state = chart.state(values.atVector(CELL_KEY))
+        if not np.all(state.cam_K[:, :2] > 0):
+            return np.full(len(holds.priors), np.inf)
+        return residual(cell_from_state(state, start))
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         z = values.atVector(CELL_KEY)

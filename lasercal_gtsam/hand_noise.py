@@ -8,11 +8,14 @@ covariance ``S`` at the corrected pose. Whitening alone, at the commanded pose, 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from lasercal_factors.batch import SpotBatch
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import pixel_covariances
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.projection import (
     beam_in_base,
@@ -21,6 +24,31 @@ from lasercal_gtsam.projection import (
     project_points,
 )
 from lasercal_gtsam.rotations import rotation_exp
+from lasercal_gtsam.solve import Solution
+from lasercal_gtsam.start import Search
+
+_ROUNDS = 4
+
+
+def with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Solution]:
+    """Refit with the robot's noise: a few rounds of corrected hand poses.
+
+    Spots that ``search`` leaves out stay out of the fit; the search returned holds all spots with
+    their corrected poses and full covariance.
+    """
+    observations, options, used = search.observations, search.options, search.batch.used
+    cov = pixel_covariances(observations, options.sigma_px)
+    eta = np.zeros((len(observations), 6))
+    for _ in range(_ROUNDS):
+        batch, eta = adjusted_batch(
+            observations, cov, solution.cell, options.hand_sigma_m, options.hand_sigma_rad, eta
+        )
+        search = replace(search, batch=batch)
+        better = search.without(~used).solve_from(solution.cell)
+        if better is None:
+            break
+        solution = replace(better, iterations=solution.iterations + better.iterations)
+    return search, solution
 
 
 def adjusted_batch(
@@ -46,11 +74,11 @@ def adjusted_batch(
     SpotBatch
         For the ordinary factors; its residual is ``r - B eta`` with covariance ``S``.
     Array
-        The next corrections, (N, 6).
+        The next corrections, (N, 6); zero for a spot that cannot be where it was seen at all.
     """
+    variances = np.r_[np.full(3, sigma_m**2), np.full(3, sigma_rad**2)]
     T = _moved(observations.T_base_hand, eta)
     B, residual = _hand_jacobian(observations, T, cell)
-    variances = np.r_[np.full(3, sigma_m**2), np.full(3, sigma_rad**2)]
     S = cov_uv + np.einsum("nij,j,nkj->nik", B, variances, B)
     free_residual = residual - np.einsum("nij,nj->ni", B, eta)
     gain = np.linalg.solve(S, free_residual[..., None])[..., 0]
@@ -78,7 +106,10 @@ def _moved(T_base_hand: Array, eta: Array) -> Array:
 
 
 def _hand_jacobian(observations: Observations, T: Array, cell: Cell) -> tuple[Array, Array]:
-    """Derivative of the pixel by the hand pose (N, 2, 6) and predicted minus seen pixel (N, 2)."""
+    """Derivative of the pixel by the hand pose (N, 2, 6) and predicted minus seen pixel (N, 2).
+
+    Zero where no spot can be.
+    """
     B, residual = np.empty((len(T), 2, 6)), np.empty((len(T), 2))
     index = np.column_stack(
         [observations.camera_index, observations.laser_index, observations.plane_index]
@@ -99,4 +130,6 @@ def _hand_jacobian(observations: Observations, T: Array, cell: Cell) -> tuple[Ar
         # d/dw of R exp(w) s = -R [s]x w, row by row: (a R) . (w x s) = (s x (a R)) . w
         B[rows, :, 3:] = np.cross(spot_hand[:, None, :], JR)
         residual[rows] = project_points(X, camera) - observations.uv[rows]
+    impossible = ~(np.isfinite(residual).all(axis=1) & np.isfinite(B).all(axis=(1, 2)))
+    B[impossible], residual[impossible] = 0.0, 0.0
     return B, residual

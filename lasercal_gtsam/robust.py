@@ -14,8 +14,9 @@ from lasercal_factors.batch import Loss
 
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import state_from_cell
+from lasercal_gtsam.holds import Holds
 from lasercal_gtsam.solve import Solution
-from lasercal_gtsam.start import Search
+from lasercal_gtsam.start import Search, refine_candidates
 
 # threshold at which the Cauchy loss is 95 % efficient for two-dimensional Gaussian residuals
 CAUCHY_THRESHOLD = 2.385
@@ -59,6 +60,9 @@ def reject_outliers(
     limit = rejection_length(count)
     lengths, scale = _lengths(search, solution, unknowns)
     if not np.any(lengths > limit * scale):
+        if solution.problem.batch.used.sum() < search.batch.used.sum():
+            everything = search.solve_from(solution.cell)
+            solution = solution if everything is None else _after(solution, everything)
         return search, solution, (None,) * count
 
     current = solution
@@ -95,6 +99,17 @@ def reject_outliers(
         for k in range(count)
     )
     return replace(search, batch=search.batch.weighted(~rejected)), current, reasons
+
+
+def without_outliers(
+    search: Search, solution: Solution, wanted: Holds
+) -> tuple[Search, Solution, tuple[str | None, ...]]:
+    """`reject_outliers`; distortion terms that had to be held because of them are freed again."""
+    kept, refit, reasons = reject_outliers(search, solution)
+    if not any(reasons) or np.array_equal(search.holds.held, wanted.held):
+        return kept, refit, reasons
+    again = refine_candidates(replace(kept, holds=wanted), [refit.cell])
+    return reject_outliers(replace(search, holds=again.problem.holds), _after(refit, again))
 
 
 def _after(before: Solution, solution: Solution) -> Solution:

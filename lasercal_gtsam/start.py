@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.cell import Camera, Cell, Intrinsics
@@ -52,6 +53,10 @@ class Search:
     holds: Holds
     options: CalibrationOptions
     loss: Loss
+
+    def without(self, aside: npt.NDArray[np.bool_]) -> Search:
+        """The same search with some spots (N,) left out."""
+        return replace(self, batch=self.batch.weighted(~aside)) if aside.any() else self
 
     def solve_from(self, cell: Cell, holds: Holds | None = None) -> Solution | None:
         """Full refinement; None where the start is impossible or the path leaves the model."""

@@ -330,6 +330,16 @@ def _block_rows(pixels, hands, first, last, path, out):
 
 
 @jit
+def _mirrored(state):
+    """Number of cameras with a focal length that is not positive: no picture is a mirror image."""
+    bad = 0.0
+    for K in state.cam_K:
+        if not (K[0] > 0.0 and K[1] > 0.0):
+            bad += 1.0
+    return bad
+
+
+@jit
 def residuals(spots, state):
     """Predicted minus seen pixel of every spot, (N, 2) px; NaN where no spot can be."""
     out = np.empty((spots.pixels.shape[1], 2))
@@ -347,7 +357,7 @@ def residuals(spots, state):
 def total_loss(spots, state, kind, c_loss):
     """Sum of `loss_value` over all spots; inf where a spot cannot be (so that LM steps back)."""
     r = np.empty((3, _PANEL))
-    total, bad = 0.0, 0.0
+    total, bad = 0.0, _mirrored(state)
     for block in spots.blocks:
         path = _path(block, state)
         for base in range(block[3], block[4], _PANEL):
@@ -377,7 +387,7 @@ def information(spots, offsets, n, state, kind, c_loss):
     H = np.zeros((n + 1, n + 1))
     S = np.empty((_PADDED, _PADDED))
     column = np.empty(COLUMNS, np.int64)
-    bad = 0.0
+    bad = _mirrored(state)
     for m in range(len(spots.blocks)):
         block = spots.blocks[m]
         S[:] = 0.0
