@@ -106,6 +106,7 @@ def calibrate(
     start = _start(initial)
     with progress("Looking at pictures") as show:
         account = loaded.detections(progress=show)
+    warn(account.notes)
     observations = loaded.observations(account=account)
     given = {} if sigma_px is None else {"sigma_px": sigma_px}
     options = loaded.options(
@@ -185,6 +186,6 @@ def _document(
             "pictures": looked_at(account),
             "verdicts": account.counts,
             "skipped": account.skipped,
-            "warnings": capture.warnings,
+            "warnings": [*capture.warnings, *account.notes],
         },
     }

@@ -78,6 +78,7 @@ def detect(
         loaded = _unseen(loaded)
     with progress("Looking at pictures") as show:
         account = find_spots(loaded, dict(settings), show)
+    warn(account.notes)
     if not looked_at(account):
         raise DataError(
             f"{loaded.path}: there are no pictures to look at: every row has its pixel u, v already"
@@ -179,10 +180,11 @@ def _check_replaceable(path: Path, account: SpotAccount, force: bool) -> None:
 def _report(
     account: SpotAccount, capture: Capture, spots: Path, sheet: Path, referred: bool
 ) -> list[str]:
+    from lasercal_gtsam.detect.detection import Detection
+
     pictures = looked_at(account)
     single = sum(
-        detection is not None and off is None
-        for detection, off in zip(account.detections, capture.images_off, strict=True)
+        isinstance(found, Detection) and found.single_frame for found in account.detections
     )
     lines = [f"{capture.path}: {count(pictures, 'picture')} looked at"]
     lines.append(f"  used ({sum(account.usable)})")
@@ -226,6 +228,7 @@ def _document(account: SpotAccount, capture: Capture, spots: Path, sheet: Path) 
         "capture": str(capture.path),
         "pictures": looked_at(account),
         "verdicts": account.counts,
+        "notes": account.notes,
         "spots": [
             {
                 "id": row.id,

@@ -16,6 +16,7 @@ _EXPORTS = {
     "contact_sheet": "sheet",
     "detect_spot": "pipeline",
     "median_frame": "reference",
+    "spots_in_median": "reference",
 }
 
 __all__ = [
@@ -25,13 +26,14 @@ __all__ = [
     "contact_sheet",
     "detect_spot",
     "median_frame",
+    "spots_in_median",
 ]
 
 if TYPE_CHECKING:
     from lasercal_gtsam.detect.detection import Detection, RunnerUp
     from lasercal_gtsam.detect.options import DetectionOptions
     from lasercal_gtsam.detect.pipeline import detect_spot
-    from lasercal_gtsam.detect.reference import median_frame
+    from lasercal_gtsam.detect.reference import median_frame, spots_in_median
     from lasercal_gtsam.detect.sheet import contact_sheet
 
 

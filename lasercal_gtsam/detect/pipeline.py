@@ -42,23 +42,27 @@ def detect_spot(on: Any, off: Any = None, options: DetectionOptions | None = Non
     """
     options = options or DetectionOptions()
     frames = read_frames(on, off, options)
-    if frames.off is None:
-        difference = single_difference(frames.on, frames.step)
-    else:
-        difference = pair_difference(
-            frames.on,
-            frames.off,
-            frames.step,
-            options.clutter_shift_px,
-            options.clutter_gain,
-            frames.blind,
-        )
+    difference = laser_light(frames, options)
     candidates = find_candidates(difference, options.threshold_sigmas)
     if not candidates.ranked:
         return _nothing(frames, difference, options)
     # the strongest or nothing: a fall-back to the next would accept whatever is left
     spot = measure_spot(frames, difference, candidates.blurred, candidates.ranked[0], options)
     return _detection(spot, _rival(spot, candidates.ranked), frames, difference, options)
+
+
+def laser_light(frames: Frames, options: DetectionOptions) -> Difference:
+    """On minus off, or where there is no off frame, on minus its own smooth background."""
+    if frames.off is None:
+        return single_difference(frames.on, frames.step)
+    return pair_difference(
+        frames.on,
+        frames.off,
+        frames.step,
+        options.clutter_shift_px,
+        options.clutter_gain,
+        frames.blind,
+    )
 
 
 def _rival(spot: Measurement, ranked: tuple[Candidate, ...]) -> RunnerUp | None:

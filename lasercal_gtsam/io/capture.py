@@ -14,6 +14,7 @@ from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.io.files import sha256_of
 from lasercal_gtsam.io.pictures import OptionalPaths, Picture, find_pictures, read_picture
 from lasercal_gtsam.io.spot_account import FoundSpot, SpotAccount
+from lasercal_gtsam.io.stand_in import StandIns
 from lasercal_gtsam.io.wording import at_most, some
 from lasercal_gtsam.observations import Names, Observations
 from lasercal_gtsam.options import CalibrationOptions
@@ -95,6 +96,10 @@ class Capture(FrozenData):
     ) -> SpotAccount:
         """Account for every row: given pixels as they are, pictures through the detector.
 
+        Rows without a laser-off picture get the median of their scene's laser-on pictures in its
+        place, where five or more of one camera and plane can give one (`StandIns`); the account's
+        notes and the rows' reasons say so.
+
         Parameters
         ----------
         detector : ``(on, off or None) -> detection``; None: `lasercal_gtsam.detect.detect_spot`
@@ -109,20 +114,21 @@ class Capture(FrozenData):
         todo = [k for k, image in enumerate(self.images_on) if not self.verdict[k] and image]
         found: dict[int, FoundSpot] = {}
         problems: list[str] = []
+        stand_ins = self._stand_ins(todo)
         if todo and detector is None:
             detector = self._default_detector()
         for done, k in enumerate(todo, start=1):
-            pictures = self._read_pictures(k, problems)
+            on, off = self._read_pictures(k, problems)
             if detector is not None and not problems:
                 try:
-                    found[k] = detector(*pictures)
+                    found[k] = detector(on, stand_ins.frame(k, on) if off is None else off)
                 except (DataError, DetectionError) as error:
                     problems.append(f"id {self.ids[k]}: {self.images_on[k]}: {error}")
             if progress is not None:
                 progress(done, len(todo))
         if problems:
             raise DataError(*at_most(problems))
-        return self._account(found)
+        return self._account(found, stand_ins)
 
     def observations(
         self,
@@ -192,9 +198,21 @@ class Capture(FrozenData):
                 pictures.append(None if path is None else read_picture(path, size, where))
             except DataError as error:
                 problems += error.problems
+                pictures.append(None)
         return pictures
 
-    def _account(self, found: Mapping[int, FoundSpot]) -> SpotAccount:
+    def _stand_ins(self, todo: list[int]) -> StandIns:
+        """Stand-ins for the laser-off pictures that rows do not have."""
+        images = {k: path for k in todo if not self.images_off[k] and (path := self.images_on[k])}
+
+        def read(k: int) -> Picture:
+            size = self.image_size[str(self.cameras[k])]
+            return read_picture(images[k], size, f"id {self.ids[k]}")
+
+        scenes = {k: (str(self.cameras[k]), str(self.planes[k])) for k in images}
+        return StandIns(scenes, read, self.saturation)
+
+    def _account(self, found: Mapping[int, FoundSpot], stand_ins: StandIns) -> SpotAccount:
         uv, cov = self.uv.copy(), self.cov_uv.copy()
         verdict, reason, source = list(self.verdict), list(self.reason), ["table"] * len(self)
         for k, image in enumerate(self.images_on):
@@ -203,6 +221,8 @@ class Capture(FrozenData):
                 uv[k], cov[k] = spot.uv, spot.cov_uv
                 verdict[k] = "used" if spot.usable else spot.verdict
                 reason[k], source[k] = spot.reason, str(image)
+                if k in stand_ins.remarks:
+                    reason[k] = "; ".join(filter(None, [spot.reason, stand_ins.remarks[k]]))
             elif not verdict[k]:
                 verdict[k], reason[k] = "missing", "the row has neither a pixel nor a picture"
                 source[k] = ""
@@ -214,6 +234,7 @@ class Capture(FrozenData):
             uv=uv,
             cov_uv=cov,
             detections=tuple(found.get(k) for k in range(len(self))),
+            notes=tuple(stand_ins.notes),
         )
 
 

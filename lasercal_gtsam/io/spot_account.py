@@ -67,6 +67,7 @@ class SpotAccount(FrozenData):
     uv, cov_uv : (N, 2) px and (N, 2, 2) px^2; NaN where there is none. A spot that was found but
         is not to be used keeps its pixel here
     detections : what the detector said, for rows with pictures, else None
+    notes : how the pictures were looked at, where that needs a word; sentences
     """
 
     ids: tuple[str, ...]
@@ -76,6 +77,7 @@ class SpotAccount(FrozenData):
     uv: Array
     cov_uv: Array
     detections: tuple[FoundSpot | None, ...]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         count = len(self.ids)

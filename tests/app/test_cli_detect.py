@@ -161,14 +161,31 @@ def test_json_lists_every_row(lasercal, capture):
         assert one["source"].endswith(f"{one['id']}.png")
 
 
-def test_without_a_laser_off_picture_it_says_what_to_do(lasercal, capture):
+def without_off_pictures(capture):
     head = capture / "capture.yaml"
     text = head.read_text()
     assert ', off: "images/{id}_off.png"' in text
     head.write_text(text.replace(', off: "images/{id}_off.png"', ""))
+
+
+def test_without_a_laser_off_picture_it_says_what_to_do(lasercal, capture):
+    without_off_pictures(capture)
+    table = capture / "poses.csv"
+    lines = table.read_text().splitlines(keepends=True)
+    table.write_text("".join(lines[:5]))  # too few for a median
     outcome = lasercal("detect", capture)
     assert outcome.status == 0
-    assert "16 pictures without a laser-off picture" in outcome.out
+    assert "4 pictures without a laser-off picture" in outcome.out
+
+
+def test_the_median_stands_in_for_laser_off_pictures_and_it_says_so(lasercal, capture):
+    without_off_pictures(capture)
+    outcome = lasercal("detect", capture)
+    assert outcome.status == 0
+    assert outcome.err.count("8 rows have no laser-off picture; the median of 7") == 2
+    assert "without a laser-off picture" not in outcome.out
+    rows = spots_in(capture / "spots.csv")
+    assert all(row["reason"].endswith("off frame: median of 7 laser-on pictures") for row in rows)
 
 
 def test_a_capture_with_all_its_spots_has_nothing_to_look_at(lasercal, tmp_path):
