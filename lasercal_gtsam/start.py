@@ -39,7 +39,7 @@ _SAME_COST = 1e-3
 _FOLD_CHI2 = 9.0
 # residual level (px) at which the weak priors of the staged start are weighed
 _STAGE_SIGMA_PX = 3.0
-_RESTART_STEPS = (0.03, -0.03, 0.1, -0.1)
+_RESTART_STEPS = (0.01, -0.01, 0.03, -0.03, 0.1, -0.1)
 # k2 restarts are skipped where they would begin more than this many sigmas away
 _RESTART_SIGMAS = 10.0
 
@@ -224,7 +224,10 @@ def _same_cost(a: Solution, b: Solution) -> bool:
 
 
 def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
-    """Restarts with k2 moved and k1 lowered to compensate (method 6.2, remedy 4)."""
+    """Restarts with k2 moved: k1 lowered to compensate, the rest settled around it, then all free.
+
+    Method 6.2, remedy 4; settling around the moved k2 first reaches minima that a step misses.
+    """
     found: list[Solution] = []
     for c, name in enumerate(search.observations.cameras):
         column = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("k2")
@@ -234,6 +237,8 @@ def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
         r2 = _squared_radii(best.problem, c, camera)
         r95 = float(np.quantile(r2, 0.95))
         sigma = _quick_sigma(best, column)
+        k2_held = replace(search.holds, held=search.holds.held.copy())
+        k2_held.held[column] = True
         for step in _RESTART_STEPS:
             change = step / r95**2
             if abs(change) > _RESTART_SIGMAS * sigma:
@@ -242,7 +247,9 @@ def _k2_restarts(search: Search, best: Solution) -> list[Solution]:
             moved = replace(camera.intrinsics, k1=k1, k2=camera.intrinsics.k2 + change)
             cameras = dict(best.cell.cameras)
             cameras[name] = Camera(moved, camera.T_base_camera, camera.image_size)
-            solution = search.solve_from(Cell(cameras, best.cell.lasers, best.cell.planes))
+            moved_cell = Cell(cameras, best.cell.lasers, best.cell.planes)
+            settled = search.solve_from(moved_cell, k2_held)
+            solution = None if settled is None else search.solve_from(settled.cell)
             if solution is not None:
                 found.append(solution)
     return found
