@@ -72,7 +72,7 @@ def calibrate(
     search = Search(observations, batch, holds, options, Loss())
     robust = options.robust == "auto"
     if initial is None:
-        candidates = _closed_form(observations, holds)
+        candidates = _closed_form(observations, holds, options)
         start = holds.apply(candidates[0].cell)
         aside = np.isin(observations.id, candidates[0].set_aside) & robust
         cells = [candidate.cell for candidate in candidates]
@@ -164,9 +164,12 @@ def _fit(
     )
 
 
-def _closed_form(observations: Observations, holds: Holds) -> Sequence[Candidate]:
-    """Starts from the data alone, told what is known of the cameras."""
+def _closed_form(
+    observations: Observations, holds: Holds, options: CalibrationOptions
+) -> Sequence[Candidate]:
+    """Starts from the data alone, told what is known of the cameras and of the robot."""
     from lasercal_gtsam.closed_form import closed_form_candidates
+    from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD
 
     known = holds.known.items()
     return closed_form_candidates(
@@ -175,6 +178,8 @@ def _closed_form(observations: Observations, holds: Holds) -> Sequence[Candidate
         skew={c: k["skew"] for c, k in known if "skew" in k},
         aspect=holds.aspect,
         focal_lengths={c: (k["fu"], k["fv"]) for c, k in known if {"fu", "fv"} <= set(k)},
+        # hand poses that are read back differ by the robot's noise (method 3.1)
+        group_tolerance_rad=max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad),
     )
 
 
