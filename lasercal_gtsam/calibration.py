@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.observations import Names, Observations
 from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.prediction import CellUncertainty, locate, only, predict
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,75 @@ class Calibration(FrozenData):
         lines += [table_row(p) for p in self.parameters]
         lines.append(("RMS", "", f"{self.fit.rms_px:.4g}", "", "px"))
         return text_table(lines)
+
+    def predict(
+        self,
+        T_base_hand: npt.ArrayLike,
+        *,
+        plane: str | None = None,
+        camera: str | None = None,
+        laser: str | None = None,
+    ) -> tuple[Array, Array]:
+        """Where the spot will be seen (1)-(9), and how well that is known.
+
+        Parameters
+        ----------
+        T_base_hand : (N, 4, 4) or (4, 4), metres
+        plane, camera, laser : names; may be left out where the cell has only one
+
+        Returns
+        -------
+        (N, 2) and (N, 2, 2) arrays
+            Pixels and their covariance (px^2) from the calibration alone: add the noise of a spot
+            to judge one that was seen. NaN where no spot can be.
+
+        Raises
+        ------
+        DataError
+            A name is unknown, left out where there are several, or was not calibrated.
+        """
+        names = self._parts(plane, camera, laser)
+        known = CellUncertainty(self.cell, self.covariance, self.labels)
+        return predict(known, np.asarray(T_base_hand, dtype=np.float64), *names)
+
+    def locate(
+        self,
+        uv: npt.ArrayLike,
+        *,
+        plane: str | None = None,
+        camera: str | None = None,
+        sigma_px: float = 0.0,
+    ) -> tuple[Array, Array]:
+        """Point of a working plane that is seen at a pixel (12), and how well that is known.
+
+        Parameters
+        ----------
+        uv : (N, 2) or (2,) px
+        plane, camera : names; may be left out where the cell has only one
+        sigma_px : noise of the pixels themselves, added to the calibration's
+
+        Returns
+        -------
+        (N, 3) and (N, 3, 3) arrays
+            Base points (metres) and their covariance (m^2). NaN where the ray misses the plane.
+
+        Raises
+        ------
+        DataError
+            As in `predict`.
+        """
+        on, by, _ = self._parts(plane, camera, next(iter(self.cell.lasers)))
+        known = CellUncertainty(self.cell, self.covariance, self.labels)
+        return locate(known, np.asarray(uv, dtype=np.float64), on, by, sigma_px)
+
+    def _parts(
+        self, plane: str | None, camera: str | None, laser: str | None
+    ) -> tuple[str, str, str]:
+        return (
+            only(tuple(self.cell.planes), plane, "plane"),
+            only(tuple(self.cell.cameras), camera, "camera"),
+            only(tuple(self.cell.lasers), laser, "laser"),
+        )
 
     def save(self, path: str | Path) -> None:
         """Write ``calibration.json`` atomically: the old file stays until the new one is whole."""
