@@ -24,11 +24,16 @@ COLUMNS = 23
 # columns padded to an even number; spots of a panel that stays in the first-level cache
 _PADDED, _PANEL = 24, 32
 
-# sums may be reordered (vector units); infinities and NaN keep their meaning
-_FAST = {"reassoc", "nsz", "contract"}
+# Infinities and NaN keep their meaning. Sums may be reordered (vector units) and fused only where a
+# loop is nothing but a sum: elsewhere the compiler keeps a second version of the loop, for arrays
+# that may overlap, and which one runs, with which rounding, would depend on where arrays are in
+# memory. Where every operation is rounded by itself, both versions give the same.
+_EXACT = {"nsz"}
+_FAST = {"reassoc", "contract", "nsz"}
 jit = njit(cache=True, nogil=True, error_model="numpy")
-_jit_fast = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
-_inline = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST, inline="always")
+_jit_sum = njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+_jit_fill = njit(cache=True, nogil=True, error_model="numpy", fastmath=_EXACT)
+_inline = njit(cache=True, nogil=True, error_model="numpy", fastmath=_EXACT, inline="always")
 
 
 @jit
@@ -141,7 +146,7 @@ def _impossible(s, z, r2, k1, k2):
     return 0.0 if ok else 1.0
 
 
-@_jit_fast
+@_jit_fill
 def _panel_residuals(pixels, hands, base, count, path, out):
     """Fill ``out`` (3, count): predicted minus seen pixel, and 1.0 where impossible."""
     u, q, _, n, d, _, R, t, K = path
@@ -162,7 +167,7 @@ def _panel_residuals(pixels, hands, base, count, path, out):
         out[2, i] = _impossible(s, z, r2, k1, k2)
 
 
-@_jit_fast
+@_jit_sum
 def _panel_loss(pixels, base, count, r, kind, c_loss):
     """(sum of the losses, impossible spots) of a panel's residuals ``r`` (3, count)."""
     total, bad = 0.0, 0.0
@@ -180,8 +185,9 @@ def _panel_loss(pixels, base, count, r, kind, c_loss):
 def _fill_panel(pixels, hands, base, count, path, Q):
     """Whitened rows of spots base ... base+count-1 as columns of ``Q`` (24, 2 _PANEL).
 
-    Column i holds the u row of spot base+i, column _PANEL+i its v row. Returns the number of
-    impossible spots. Inlined, so that the compiler sees the constant shape of ``Q``.
+    Column i holds the u row of spot base+i, column _PANEL+i its v row; the padding row says 1.0 in
+    column i where the spot is impossible. Inlined, so that the compiler sees the constant shape of
+    ``Q``.
     """
     u, q, Rl, n, d, B, R, t, K = path
     u0, u1, u2, q0, q1, q2, n0, n1, n2 = u[0], u[1], u[2], q[0], q[1], q[2], n[0], n[1], n[2]
@@ -190,7 +196,6 @@ def _fill_panel(pixels, hands, base, count, path, Q):
     fu, fv, sk, cu, cv, k1, k2, p1, p2 = K[0], K[1], K[2], K[3], K[4], K[5], K[6], K[7], K[8]
     l00, l10, l20, l01, l11, l21 = Rl[0, 0], Rl[1, 0], Rl[2, 0], Rl[0, 1], Rl[1, 1], Rl[2, 1]
     B00, B10, B20, B01, B11, B21 = B[0, 0], B[1, 0], B[2, 0], B[0, 1], B[1, 1], B[2, 1]
-    bad = 0.0
     for i in range(count):
         k = base + i
         b0, b1, b2, x0, x1, x2, inu, s = _hit(k, hands, u0, u1, u2, q0, q1, q2, n0, n1, n2, d)
@@ -201,7 +206,7 @@ def _fill_panel(pixels, hands, base, count, path, Q):
         iz = 1.0 / pz
         x, y = px * iz, py * iz
         xd, yd, r2, g = _distort(x, y, k1, k2, p1, p2)
-        bad += _impossible(s, pz, r2, k1, k2)
+        Q[COLUMNS, i] = _impossible(s, pz, r2, k1, k2)
         w00, w01, w11 = pixels[2, k], pixels[3, k], pixels[4, k]
         du = fu * xd + sk * yd + cu - pixels[0, k]
         dv = fv * yd + cv - pixels[1, k]
@@ -269,16 +274,15 @@ def _fill_panel(pixels, hands, base, count, path, Q):
             Q[16, j] = s * f2
             Q[17, j] = f1
             Q[18, j] = f2
-    return bad
 
 
-@_jit_fast
+@_jit_sum
 def _add_products(Q, count, S):
     """Add ``Q Q^T`` over the panel's first ``count`` spots to ``S`` (24, 24), upper 2x2 blocks.
 
     The rest of the panel is cleared: a loop of constant length is what the vector units want.
     """
-    for i in range(COLUMNS):
+    for i in range(_PADDED):
         for k in range(count, _PANEL):
             Q[i, k] = 0.0
             Q[i, _PANEL + k] = 0.0
@@ -297,14 +301,13 @@ def _add_products(Q, count, S):
             S[i + 1, j + 1] += s11
 
 
-@_jit_fast
+@_jit_fill
 def _block_information(pixels, hands, first, last, path, kind, c_loss, S):
     """Add ``[J r]^T [J r]`` of one block to ``S`` (24, 24); returns the impossible spots."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
-    bad = 0.0
     for base in range(first, last, _PANEL):
         count = min(_PANEL, last - base)
-        bad += _fill_panel(pixels, hands, base, count, path, Q)
+        _fill_panel(pixels, hands, base, count, path, Q)
         if kind != LOSS_NONE:
             for i in range(count):
                 e0, e1 = Q[22, i], Q[22, _PANEL + i]
@@ -313,10 +316,10 @@ def _block_information(pixels, hands, first, last, path, kind, c_loss, S):
                     Q[j, i] *= w
                     Q[j, _PANEL + i] *= w
         _add_products(Q, count, S)
-    return bad
+    return S[COLUMNS, COLUMNS]
 
 
-@_jit_fast
+@_jit_fill
 def _block_rows(pixels, hands, first, last, path, out):
     """Fill ``out`` (N, 2, 23) with the rows of one block."""
     Q = np.zeros((_PADDED, 2 * _PANEL))
