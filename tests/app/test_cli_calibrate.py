@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from cli_support import Cli, contents
 import lasercal_gtsam as lc
 import lasercal_gtsam.api
 from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.cli.main import main
 from lasercal_gtsam.io.cell_file import load_cell
 
 
@@ -21,20 +23,29 @@ def lasercal(capsys):
     return Cli(capsys)
 
 
-@pytest.fixture
-def exact(lasercal, tmp_path):
-    """A noise-free capture."""
-    lasercal("simulate", tmp_path / "exact", "--preset", "paper-2", "--noise", "0")
-    return tmp_path / "exact"
-
-
-@pytest.fixture
-def noisy(lasercal, tmp_path):
-    """The same cell with 1 px of noise."""
-    folder = tmp_path / "noisy"
-    noise = ("--pixel-px", "1", "--hand-mm", "0", "--hand-deg", "0")
-    lasercal("simulate", folder, "--preset", "paper-2", *noise)
+@pytest.fixture(scope="module")
+def captures(tmp_path_factory):
+    """The paper's cell with two planes: without noise, and with 1 px."""
+    folder = tmp_path_factory.mktemp("captures")
+    one_pixel = ("--pixel-px", "1", "--hand-mm", "0", "--hand-deg", "0")
+    for name, noise in (("exact", ("--noise", "0")), ("noisy", one_pixel)):
+        assert main(["simulate", str(folder / name), "--preset", "paper-2", *noise]) == 0
     return folder
+
+
+@pytest.fixture
+def exact(captures, tmp_path):
+    return shutil.copytree(captures / "exact", tmp_path / "exact")
+
+
+@pytest.fixture
+def noisy(captures, tmp_path):
+    return shutil.copytree(captures / "noisy", tmp_path / "noisy")
+
+
+def near(folder):
+    """A start that is given: where the start does not matter it saves time."""
+    return ("--initial", folder / "truth.json")
 
 
 def table_of(text):
@@ -74,7 +85,7 @@ def test_an_exact_capture_gives_the_truth(lasercal, exact):
 
 
 def test_what_is_printed_is_what_is_saved(lasercal, noisy):
-    outcome = lasercal("calibrate", noisy / "capture.yaml")
+    outcome = lasercal("calibrate", noisy / "capture.yaml", *near(noisy))
     result = lc.load_calibration(noisy / "calibration.json")
     assert result.table() in outcome.out
     assert list(table_of(outcome.out))[1:-1] == [p.name for p in result.parameters]
@@ -86,7 +97,7 @@ def test_what_is_printed_is_what_is_saved(lasercal, noisy):
 
 
 def test_json_is_one_document_and_reads_back(lasercal, noisy):
-    document = lasercal.json("calibrate", noisy)
+    document = lasercal.json("calibrate", noisy, *near(noisy))
     saved = json.loads((noisy / "calibration.json").read_text())
     run = document.pop("run")
     for one in (document, saved):
@@ -103,14 +114,14 @@ def test_warnings_go_to_stderr_so_that_stdout_stays_a_document(lasercal, noisy):
         rows.append({**rows[0], "id": "again"})
 
     rewrite(noisy, repeat)
-    outcome = lasercal("calibrate", noisy, "--json")
+    outcome = lasercal("calibrate", noisy, *near(noisy), "--json")
     assert outcome.err.startswith("Warning: poses.csv: 1 rows repeat")
     assert json.loads(outcome.out)["run"]["warnings"] == [outcome.err[len("Warning: ") :].strip()]
 
 
 def test_the_output_may_be_a_file_or_a_folder(lasercal, noisy, tmp_path):
-    assert lasercal("calibrate", noisy, "-o", tmp_path / "a.json").status == 0
-    assert lasercal("calibrate", noisy, "-o", tmp_path).status == 0
+    assert lasercal("calibrate", noisy, *near(noisy), "-o", tmp_path / "a.json").status == 0
+    assert lasercal("calibrate", noisy, *near(noisy), "-o", tmp_path).status == 0
     assert lc.load_calibration(tmp_path / "a.json") == lc.load_calibration(
         tmp_path / "calibration.json"
     )
@@ -119,9 +130,9 @@ def test_the_output_may_be_a_file_or_a_folder(lasercal, noisy, tmp_path):
 
 def test_a_calibration_is_replaced_but_nothing_else(lasercal, noisy):
     target = noisy / "calibration.json"
-    lasercal("calibrate", noisy, "--distortion", "none")
+    lasercal("calibrate", noisy, *near(noisy), "--distortion", "none")
     first = target.read_bytes()
-    assert lasercal("calibrate", noisy).status == 0
+    assert lasercal("calibrate", noisy, *near(noisy)).status == 0
     assert target.read_bytes() != first
     for precious in (b'{"format": "something else"}', b"notes", b"[1, 2]"):
         target.write_bytes(precious)
@@ -146,7 +157,7 @@ def test_a_result_that_cannot_be_saved_is_printed_all_the_same(lasercal, noisy, 
         raise lc.DataError("calibration.json: cannot be written: No space left on device")
 
     monkeypatch.setattr("lasercal_gtsam.io.calibration_file.write_text", full)
-    outcome = lasercal("calibrate", noisy)
+    outcome = lasercal("calibrate", noisy, *near(noisy))
     assert outcome.status == 1
     assert "fu" in table_of(outcome.out)
     assert "Saved" not in outcome.out
@@ -166,7 +177,7 @@ def unconverged(monkeypatch):
 
 
 def test_an_answer_not_to_be_trusted_is_not_saved(lasercal, noisy, unconverged):
-    outcome = lasercal("calibrate", noisy)
+    outcome = lasercal("calibrate", noisy, *near(noisy))
     assert outcome.status == 1
     assert "fu" in table_of(outcome.out)
     assert outcome.err.startswith("Error: not to be trusted: planted; nothing was saved")
@@ -175,7 +186,7 @@ def test_an_answer_not_to_be_trusted_is_not_saved(lasercal, noisy, unconverged):
 
 
 def test_an_answer_not_to_be_trusted_is_saved_on_request(lasercal, noisy, unconverged):
-    outcome = lasercal("calibrate", noisy, "--keep-unconverged", "--json")
+    outcome = lasercal("calibrate", noisy, *near(noisy), "--keep-unconverged", "--json")
     assert outcome.status == 1
     assert json.loads(outcome.out)["fit"]["converged"] is False
     assert lc.load_calibration(noisy / "calibration.json").fit.converged is False
@@ -220,18 +231,19 @@ def rows_of(document):
 
 
 def test_distortion_chooses_the_terms(lasercal, noisy):
-    none = rows_of(lasercal.json("calibrate", noisy, "--distortion", "none"))
+    args = ("calibrate", noisy, *near(noisy), "--distortion")
+    none = rows_of(lasercal.json(*args, "none"))
     assert [none[name]["sigma"] for name in ("k1", "k2", "p1", "p2")] == [0, 0, 0, 0]
-    some = rows_of(lasercal.json("calibrate", noisy, "--distortion", "k1,p2"))
+    some = rows_of(lasercal.json(*args, "k1,p2"))
     assert [some[name]["sigma"] > 0 for name in ("k1", "k2", "p1", "p2")] == [1, 0, 0, 1]
-    outcome = lasercal("calibrate", noisy, "--distortion", "none")
+    outcome = lasercal(*args, "none")
     assert "Held or assumed:" in outcome.out
     assert table_of(outcome.out)["k1"][2] == "held"
 
 
 def test_known_values_are_held_and_said(lasercal, noisy):
     known = ("--known", "principal_point=320,240", "--known", "skew=0", "--known", "camera.k2=0.01")
-    outcome = lasercal("calibrate", noisy, *known)
+    outcome = lasercal("calibrate", noisy, *near(noisy), *known)
     assert outcome.status == 0, outcome.err
     rows = table_of(outcome.out)
     for name, value in (("u0", 320), ("v0", 240), ("alpha_c", 0), ("k2", 0.01)):
@@ -246,7 +258,7 @@ def test_known_values_are_held_and_said(lasercal, noisy):
 def test_known_wins_over_the_capture(lasercal, noisy):
     head = noisy / "capture.yaml"
     head.write_text(head.read_text() + "known: {skew: 1.5, u0: 321}\n")
-    rows = rows_of(lasercal.json("calibrate", noisy, "--known", "skew=0"))
+    rows = rows_of(lasercal.json("calibrate", noisy, *near(noisy), "--known", "skew=0"))
     assert rows["alpha_c"]["refined"] == 0
     assert (rows["u0"]["refined"], rows["u0"]["sigma"]) == (321, 0)
 
@@ -269,16 +281,17 @@ def test_an_outlier_is_named_unless_that_is_switched_off(lasercal, noisy):
     assert outcome.status == 0
     assert "Rejected: 1 spot" in outcome.out
     assert "s008 (plane 1): residual" in outcome.out
-    kept = lasercal.json("calibrate", noisy, "--robust", "none")
+    kept = lasercal.json("calibrate", noisy, *near(noisy), "--robust", "none")
     assert kept["fit"]["n_rejected"] == 0
     assert kept["fit"]["sigma0"] > 2
 
 
 def test_sigma_px_wins_over_the_capture(lasercal, noisy):
-    stated = lasercal.json("calibrate", noisy)["fit"]["sigma0"]
-    doubled = lasercal.json("calibrate", noisy, "--sigma-px", "2")["fit"]["sigma0"]
+    args = ("calibrate", noisy, *near(noisy))
+    stated = lasercal.json(*args)["fit"]["sigma0"]
+    doubled = lasercal.json(*args, "--sigma-px", "2")["fit"]["sigma0"]
     assert doubled == pytest.approx(stated / 2, rel=1e-6)
-    outcome = lasercal("calibrate", noisy, "--sigma-px", "0.2")
+    outcome = lasercal(*args, "--sigma-px", "0.2")
     assert "less exact than stated" in outcome.out
 
 
@@ -286,7 +299,7 @@ def test_without_stated_noise_the_pixel_sigma_is_estimated(lasercal, noisy):
     head = noisy / "capture.yaml"
     lines = [line for line in head.read_text().splitlines() if not line.startswith("noise")]
     head.write_text("\n".join(lines) + "\n")
-    outcome = lasercal("calibrate", noisy)
+    outcome = lasercal("calibrate", noisy, *near(noisy))
     sigma0 = lc.load_calibration(noisy / "calibration.json").fit.sigma0
     assert f"Noise of a pixel coordinate, from the residuals: {sigma0:.3g} px" in outcome.out
     assert 0.7 < sigma0 < 1.3
