@@ -193,7 +193,8 @@ def test_an_answer_not_to_be_trusted_is_saved_on_request(lasercal, noisy, unconv
 
 
 def test_initial_may_be_a_cell_a_truth_or_a_calibration(lasercal, noisy, tmp_path):
-    reference = lasercal.json("calibrate", noisy, "-o", tmp_path / "a.json")
+    command = ("calibrate", noisy, "--distortion", "none")  # which has one minimum
+    reference = lasercal.json(*command, "-o", tmp_path / "a.json")
     truth = json.loads((noisy / "truth.json").read_text())
     drawing = {key: truth[key] for key in ("cameras", "lasers", "planes")}
     drawing["cameras"]["camera"]["T_base_camera"].pop("matrix")
@@ -201,7 +202,7 @@ def test_initial_may_be_a_cell_a_truth_or_a_calibration(lasercal, noisy, tmp_pat
     (tmp_path / "cell.json").write_text(json.dumps(drawing))
     assert isinstance(load_cell(tmp_path / "cell.json"), Cell)
     for start in (tmp_path / "cell.json", noisy / "truth.json", tmp_path / "a.json"):
-        again = lasercal.json("calibrate", noisy, "-o", tmp_path / "b.json", "--initial", start)
+        again = lasercal.json(*command, "-o", tmp_path / "b.json", "--initial", start)
         for one, other in zip(reference["parameters"], again["parameters"], strict=True):
             assert other["refined"] == pytest.approx(one["refined"], abs=0.01 * one["sigma"])
     assert load_cell(tmp_path / "a.json") == lc.load_calibration(tmp_path / "a.json").cell
