@@ -11,6 +11,7 @@ from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
 from lasercal_gtsam.cli.outputs import check_calibration_target
 from lasercal_gtsam.cli.texts import account_lines, count, looked_at, result_lines
 from lasercal_gtsam.cli.values import Assignment, Distortion, Number
+from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
@@ -116,17 +117,21 @@ def calibrate(
     from lasercal_gtsam.api import calibrate as solve
 
     result = solve(observations, initial=start, options=options)
-    saved = target if result.fit.converged or keep_unconverged else None
-    try:
+    saved, failure = None, None
+    if result.fit.converged or keep_unconverged:
+        try:
+            save(result, target, loaded)
+            saved = target
+        except DataError as error:  # a full disk must not cost the answer
+            failure = error
+    if as_json:
+        print_json(_document(result, loaded, account, saved))
+    else:
+        click.echo("\n".join(_report(result, loaded, account)))
         if saved is not None:
-            save(result, saved, loaded)
-    finally:  # a full disk must not cost the answer
-        if as_json:
-            print_json(_document(result, loaded, account, saved))
-        else:
-            click.echo("\n".join(_report(result, loaded, account)))
-    if saved is not None and not as_json:
-        click.echo(f"Saved {saved}.")
+            click.echo(f"Saved {saved}.")
+    if failure is not None:
+        raise failure
     if result.fit.converged:
         return 0
     outcome = "saved all the same" if saved else "nothing was saved (see --keep-unconverged)"

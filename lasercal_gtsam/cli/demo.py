@@ -50,7 +50,7 @@ _CONTENTS = {
     "--seed",
     metavar="N",
     type=click.IntRange(min=0),
-    default=0,
+    default=1,
     show_default=True,
     help="Another seed is another robot cell, with other pictures.",
 )
@@ -79,7 +79,10 @@ def demo(out: Path, seed: int, force: bool, as_json: bool) -> int:
         print_json(_document(out, seed, result, rows, account))
     else:
         click.echo("\n".join(_report(out, capture, account, result, rows)))
-    return 0 if result.fit.converged else 1
+    if result.fit.converged:
+        return 0
+    click.echo(f"Error: {result.fit.status}", err=True)
+    return 1
 
 
 class Comparison(NamedTuple):
