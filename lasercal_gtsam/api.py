@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.calibration import (
     Calibration,
@@ -18,14 +17,22 @@ from lasercal_gtsam.calibration import (
     rms_px,
 )
 from lasercal_gtsam.cell import Cell
-from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.errors import DataError, DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
-from lasercal_gtsam.hand_noise import with_hand_noise
-from lasercal_gtsam.holds import Holds, resolve_holds
+from lasercal_gtsam.hand_noise import refine_with_hand_noise
+from lasercal_gtsam.holds import resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
-from lasercal_gtsam.robust import reject_outliers, without_outliers
+from lasercal_gtsam.robust import (
+    Accepted,
+    Finished,
+    Mask,
+    Ways,
+    lengths_of,
+    parts_of,
+    refine_without_outliers,
+)
 from lasercal_gtsam.solve import Solution, fold_warnings
 from lasercal_gtsam.start import Search, refine_candidates, refine_given
 from lasercal_gtsam.uncertainty import Uncertainty, estimate_uncertainty, table_parameters
@@ -66,44 +73,79 @@ def calibrate(
         No start could be refined.
     """
     options = options or CalibrationOptions()
-    _check_supported(options)
+    _check_request(observations, initial, options)
     holds = resolve_holds(observations, options, initial)
     batch = make_batch(observations, options.sigma_px)
-    search = Search(observations, batch, holds, options, Loss())
-    robust = options.robust == "auto"
-    if initial is None:
-        candidates = _closed_form(observations, holds, options)
-        start = holds.apply(candidates[0].cell)
-        aside = np.isin(observations.id, candidates[0].set_aside) & robust
-        cells = [candidate.cell for candidate in candidates]
-        solution = refine_candidates(search.without(aside), cells)
+    search = Search(observations, batch, holds, options)
+    ways = _given_start(initial) if initial is not None else _closed_form_starts(search)
+
+    def finish(solution: Solution, rejected: Mask) -> Finished:
+        if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
+            return Finished(*refine_with_hand_noise(search, solution, rejected))
+        return Finished(solution, lengths_of(search, solution.cell))
+
+    if options.robust == "auto":
+        accepted = refine_without_outliers(search, ways, finish)
     else:
-        start = initial
-        solution = refine_given(search, initial)
-    search = replace(search, holds=solution.problem.holds)
-    reasons: tuple[str | None, ...] = (None,) * len(observations)
-    if robust:
-        search, solution, reasons = without_outliers(search, solution, holds)
-    if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
-        search, solution = with_hand_noise(search, solution)
-        if robust:
-            search, solution, reasons = reject_outliers(search, solution)
-    return assemble(observations, options, start, solution, batch, reasons)
+        finished = finish(ways.refine(search, ways.starts), np.zeros(len(batch), np.bool_))
+        accepted = Accepted(finished, (None,) * len(batch), ways.starts[0])
+    if initial is not None:
+        accepted = accepted._replace(start=initial)
+    return assemble(search, accepted)
 
 
-def assemble(
-    observations: Observations,
-    options: CalibrationOptions,
-    start: Cell,
-    solution: Solution,
-    batch: SpotBatch,
-    reasons: tuple[str | None, ...],
-) -> Calibration:
+def _given_start(initial: Cell) -> Ways:
+    return Ways([initial], lambda search, cells: refine_given(search, cells[0]))
+
+
+def _closed_form_starts(search: Search) -> Ways:
+    """Starts from the data alone, told what is known of the cameras and of the robot."""
+    from lasercal_gtsam.closed_form import closed_form_candidates
+    from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD
+
+    holds, options = search.holds, search.options
+    known = holds.known.items()
+    hints: dict[str, Any] = {
+        "principal_point": {c: (k["u0"], k["v0"]) for c, k in known if {"u0", "v0"} <= set(k)},
+        "skew": {c: k["skew"] for c, k in known if "skew" in k},
+        "aspect": holds.aspect,
+        "focal_lengths": {c: (k["fu"], k["fv"]) for c, k in known if {"fu", "fv"} <= set(k)},
+        # hand poses that are read back differ by the robot's noise (method 3.1)
+        "group_tolerance_rad": max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad),
+    }
+    failure: DegenerateError | None = None
+    found: Sequence[Candidate] = ()
+    try:
+        found = closed_form_candidates(search.observations, **hints)
+    except DegenerateError as error:
+        failure = error
+
+    def refine(search: Search, cells: Sequence[Cell]) -> Solution:
+        if failure is not None and not cells:
+            raise failure
+        return refine_candidates(search, cells)
+
+    def closed_form(part: Observations) -> Cell:
+        return closed_form_candidates(part, **hints)[0].cell
+
+    return Ways(
+        [holds.apply(candidate.cell) for candidate in found],
+        refine,
+        parts_of(search.observations, closed_form, options.seed),
+        suspicious=bool(found and found[0].set_aside),
+    )
+
+
+def assemble(search: Search, accepted: Accepted) -> Calibration:
     """Sigmas, table, spots and the status sentence of a solution.
 
-    ``batch`` holds the spots as observed (commanded hand poses): the residuals refer to them.
+    The residuals refer to the spots as observed, with the commanded hand poses.
     """
+    observations, options, batch = search.observations, search.options, search.batch
+    (solution, _, sigma_px), reasons, start = accepted
     uncertainty = estimate_uncertainty(solution)
+    if sigma_px is not None:  # found with the robot's noise; what is left of the scale is about 1
+        uncertainty = replace(uncertainty, sigma0=sigma_px * uncertainty.sigma0)
     problem = solution.problem
     cell = _with_unobserved(solution.cell, start)
     residuals = batch.residuals(state_from_cell(solution.cell))
@@ -164,25 +206,6 @@ def _fit(
     )
 
 
-def _closed_form(
-    observations: Observations, holds: Holds, options: CalibrationOptions
-) -> Sequence[Candidate]:
-    """Starts from the data alone, told what is known of the cameras and of the robot."""
-    from lasercal_gtsam.closed_form import closed_form_candidates
-    from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD
-
-    known = holds.known.items()
-    return closed_form_candidates(
-        observations,
-        principal_point={c: (k["u0"], k["v0"]) for c, k in known if {"u0", "v0"} <= set(k)},
-        skew={c: k["skew"] for c, k in known if "skew" in k},
-        aspect=holds.aspect,
-        focal_lengths={c: (k["fu"], k["fv"]) for c, k in known if {"fu", "fv"} <= set(k)},
-        # hand poses that are read back differ by the robot's noise (method 3.1)
-        group_tolerance_rad=max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad),
-    )
-
-
 def _restricted(cell: Cell, like: Cell) -> Cell:
     """The parts of ``cell`` that ``like`` has, in its order."""
     return Cell(
@@ -201,7 +224,13 @@ def _with_unobserved(estimate: Cell, start: Cell) -> Cell:
     )
 
 
-def _check_supported(options: CalibrationOptions) -> None:
+def _check_request(
+    observations: Observations, initial: Cell | None, options: CalibrationOptions
+) -> None:
+    if not len(observations):
+        raise DataError("calibrate: there are no spots")
+    if initial is not None and not isinstance(initial, Cell):
+        raise DataError(f"initial: expected a Cell, got {type(initial).__name__}")
     if options.robust not in ("auto", "none"):
         raise DataError(
             f"options.robust: {options.robust!r} is not available yet; use 'auto' (outliers are "

@@ -9,13 +9,16 @@ covariance ``S`` at the corrected pose. Whitening alone, at the commanded pose, 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from lasercal_factors.batch import SpotBatch
 
 from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.errors import SolveError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import pixel_covariances
+from lasercal_gtsam.graph import state_from_cell
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.projection import (
     beam_in_base,
@@ -27,89 +30,157 @@ from lasercal_gtsam.rotations import rotation_exp
 from lasercal_gtsam.solve import Solution
 from lasercal_gtsam.start import Search
 
-_ROUNDS = 4
+_MAX_ROUNDS = 12
+# rounds end when the estimate moves by less than this many sigmas
+_SETTLED_SIGMAS = 1e-5
+_EXACT_PX = 1e-3
+# range in which a pixel sigma is looked for (px), and its relative precision
+_SIGMA_RANGE_PX = (1e-3, 1e3)
+_SIGMA_STEPS = 40
 
 
-def with_hand_noise(search: Search, solution: Solution) -> tuple[Search, Solution]:
-    """Refit with the robot's noise: a few rounds of corrected hand poses.
+class HandNoise(NamedTuple):
+    """Noise of a hand pose, 1 sigma per axis: translation (m), rotation (rad)."""
 
-    Spots that ``search`` leaves out stay out of the fit; the search returned holds all spots with
-    their corrected poses and full covariance.
-    """
-    observations, options, used = search.observations, search.options, search.batch.used
-    cov = pixel_covariances(observations, options.sigma_px)
-    eta = np.zeros((len(observations), 6))
-    for _ in range(_ROUNDS):
-        batch, eta = adjusted_batch(
-            observations, cov, solution.cell, options.hand_sigma_m, options.hand_sigma_rad, eta
-        )
-        search = replace(search, batch=batch)
-        better = search.without(~used).solve_from(solution.cell)
-        if better is None:
-            break
-        solution = replace(better, iterations=solution.iterations + better.iterations)
-    return search, solution
+    sigma_m: float
+    sigma_rad: float
+
+    @property
+    def variances(self) -> Array:
+        """(6,): translation, then rotation."""
+        return np.repeat([self.sigma_m**2, self.sigma_rad**2], 3)
 
 
-def adjusted_batch(
-    observations: Observations,
-    cov_uv: Array,
-    cell: Cell,
-    sigma_m: float,
-    sigma_rad: float,
-    eta: Array,
-) -> tuple[SpotBatch, Array]:
-    """Spots with corrected hand poses and the covariance that includes the robot's.
+def refine_with_hand_noise(
+    search: Search, solution: Solution, rejected: npt.NDArray[np.bool_]
+) -> tuple[Solution, Array, float | None]:
+    """Refit with the robot's noise: rounds of corrected hand poses until nothing moves.
+
+    Where spots have no pixel sigma (neither their own nor ``options.sigma_px``), it is found along
+    with the rest: the one with which the residuals are as long as they should be.
 
     Parameters
     ----------
-    observations : spots with the commanded hand poses
-    cov_uv : (N, 2, 2) px^2, of the pixels alone
-    cell : current estimate
-    sigma_m, sigma_rad : hand noise, 1 sigma per axis
-    eta : (N, 6) corrections so far: translation in base (m), rotation in hand (rad)
+    search : as for the fit without robot noise
+    solution : that fit
+    rejected : (N,) booleans: spots left out
 
     Returns
     -------
-    SpotBatch
-        For the ordinary factors; its residual is ``r - B eta`` with covariance ``S``.
-    Array
-        The next corrections, (N, 6); zero for a spot that cannot be where it was seen at all.
+    Solution
+    lengths : (N,) residual length of each spot in sigmas of pixel and hand together; infinite where
+        no spot can be
+    sigma_px : pixel sigma found; None where none was missing
+
+    Raises
+    ------
+    SolveError
+        The refit fails, or the rounds do not settle.
     """
-    variances = np.r_[np.full(3, sigma_m**2), np.full(3, sigma_rad**2)]
-    T = _moved(observations.T_base_hand, eta)
-    B, residual = _hand_jacobian(observations, T, cell)
-    S = cov_uv + np.einsum("nij,j,nkj->nik", B, variances, B)
+    observations, options = search.observations, search.options
+    noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
+    unknown = np.isnan(observations.cov_uv[:, 0, 0])
+    own = np.where(unknown[:, None, None], 0.0, observations.cov_uv)
+    missing = np.where(unknown, 1.0, 0.0)[:, None, None] * np.eye(2)
+    sigma_px = options.sigma_px or 1.0
+    find_sigma = options.sigma_px is None and bool(unknown.any())
+    eta = np.zeros((len(observations), 6))
+    for _ in range(_MAX_ROUNDS):
+        B, r = linearized(observations, solution.cell, eta)
+        if find_sigma:
+            dof = 2 * int((~rejected).sum()) - int(solution.problem.free.sum())
+            fixed = own + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
+            sigma_px = _missing_sigma(r[~rejected], fixed[~rejected], missing[~rejected], dof)
+        cov = own + sigma_px**2 * missing
+        eta = corrections(B, r, cov, noise)
+        # no hand pose explains an outlier: judge it at the commanded one
+        eta[rejected] = 0.0
+        everyone = corrected_batch(observations, cov, solution.cell, noise, eta)
+        batch = everyone.weighted(~rejected) if rejected.any() else everyone
+        before = batch.total_loss(state_from_cell(solution.cell), solution.problem.loss)
+        better = replace(search, batch=batch).attempt(solution.cell, solution.problem.holds)
+        if not isinstance(better, Solution):
+            raise SolveError(f"the fit fails with the robot's noise: {better}") from better
+        moved = np.sqrt(max(before - better.cost, 0.0))
+        solution = replace(better, iterations=solution.iterations + better.iterations)
+        unit = max(float(np.sqrt(better.cost / (2 * len(batch.order)))), _EXACT_PX)
+        if moved < _SETTLED_SIGMAS * unit:
+            lengths = everyone.whitened_lengths(state_from_cell(solution.cell))
+            lengths = np.where(np.isnan(lengths), np.inf, lengths)
+            return solution, lengths, sigma_px if find_sigma else None
+    raise SolveError(
+        "the corrections of the hand poses do not settle: the robot's noise is larger than the "
+        "data can bear; check hand_sigma_m and hand_sigma_rad, or set them to zero"
+    )
+
+
+def linearized(observations: Observations, cell: Cell, eta: Array) -> tuple[Array, Array]:
+    """Derivative ``B`` of the pixel by the hand pose and ``r - B eta``, at corrected hand poses.
+
+    Parameters
+    ----------
+    eta : (N, 6) corrections: translation in base (m), rotation in hand (rad)
+
+    Returns
+    -------
+    B : (N, 2, 6) px/m, px/rad; zero where no spot can be
+    free_residual : (N, 2) px, predicted minus seen pixel at the commanded pose to first order; zero
+        where no spot can be
+    """
+    B, residual = _hand_jacobian(observations, _moved(observations.T_base_hand, eta), cell)
     free_residual = residual - np.einsum("nij,nj->ni", B, eta)
+    impossible = ~np.isfinite(free_residual).all(axis=1)
+    B[impossible], free_residual[impossible] = 0.0, 0.0
+    return B, free_residual
+
+
+def corrections(B: Array, free_residual: Array, cov_uv: Array, noise: HandNoise) -> Array:
+    """Likeliest corrections of the hand poses, (N, 6): ``-Sigma B^T S^-1 (r - B eta)``."""
+    S = cov_uv + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
     gain = np.linalg.solve(S, free_residual[..., None])[..., 0]
-    next_eta = -variances * np.einsum("nij,ni->nj", B, gain)
-    T = _moved(observations.T_base_hand, next_eta)
-    B, _ = _hand_jacobian(observations, T, cell)
-    S = cov_uv + np.einsum("nij,j,nkj->nik", B, variances, B)
-    shift = np.einsum("nij,nj->ni", B, next_eta)
-    batch = SpotBatch.from_arrays(
-        observations.uv + shift,
+    return np.asarray(-noise.variances * np.einsum("nij,ni->nj", B, gain))
+
+
+def corrected_batch(
+    observations: Observations, cov_uv: Array, cell: Cell, noise: HandNoise, eta: Array
+) -> SpotBatch:
+    """Spots at corrected hand poses, for the ordinary factors.
+
+    Their residual is ``r - B eta``, their covariance ``S``: pixel and hand together.
+    """
+    T = _moved(observations.T_base_hand, eta)
+    B, _ = linearized(observations, cell, eta)
+    S = cov_uv + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
+    return SpotBatch.from_arrays(
+        observations.uv + np.einsum("nij,nj->ni", B, eta),
         S,
         T,
         observations.camera_index,
         observations.laser_index,
         observations.plane_index,
     )
-    return batch, next_eta
+
+
+def _missing_sigma(r: Array, fixed: Array, missing: Array, dof: int) -> float:
+    """Sigma with which ``sum r^T (fixed + sigma^2 missing)^-1 r = dof``, by bisection (px)."""
+    low, high = np.log(_SIGMA_RANGE_PX)
+    for _ in range(_SIGMA_STEPS):
+        middle = 0.5 * (low + high)
+        S = fixed + np.exp(2.0 * middle) * missing
+        chi2 = float(np.einsum("ni,ni->", r, np.linalg.solve(S, r[..., None])[..., 0]))
+        low, high = (middle, high) if chi2 > dof else (low, middle)
+    return float(np.exp(0.5 * (low + high)))
 
 
 def _moved(T_base_hand: Array, eta: Array) -> Array:
     T = T_base_hand.copy()
     T[:, :3, 3] += eta[:, :3]
-    T[:, :3, :3] = T[:, :3, :3] @ np.array([rotation_exp(w) for w in eta[:, 3:]])
+    T[:, :3, :3] = T[:, :3, :3] @ rotation_exp(eta[:, 3:])
     return T
 
 
 def _hand_jacobian(observations: Observations, T: Array, cell: Cell) -> tuple[Array, Array]:
-    """Derivative of the pixel by the hand pose (N, 2, 6) and predicted minus seen pixel (N, 2).
-
-    Zero where no spot can be.
-    """
+    """Derivative of the pixel by the hand pose (N, 2, 6) and predicted minus seen pixel (N, 2)."""
     B, residual = np.empty((len(T), 2, 6)), np.empty((len(T), 2))
     index = np.column_stack(
         [observations.camera_index, observations.laser_index, observations.plane_index]
@@ -130,6 +201,4 @@ def _hand_jacobian(observations: Observations, T: Array, cell: Cell) -> tuple[Ar
         # d/dw of R exp(w) s = -R [s]x w, row by row: (a R) . (w x s) = (s x (a R)) . w
         B[rows, :, 3:] = np.cross(spot_hand[:, None, :], JR)
         residual[rows] = project_points(X, camera) - observations.uv[rows]
-    impossible = ~(np.isfinite(residual).all(axis=1) & np.isfinite(B).all(axis=(1, 2)))
-    B[impossible], residual[impossible] = 0.0, 0.0
     return B, residual

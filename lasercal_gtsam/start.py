@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from lasercal_factors.batch import Loss, SpotBatch
+from lasercal_factors.batch import SpotBatch
 
 from lasercal_gtsam.cell import Camera, Cell, Intrinsics
-from lasercal_gtsam.errors import DataError, LasercalError, SolveError
+from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import CellGraph, make_graph, state_from_cell
 from lasercal_gtsam.holds import Holds
@@ -52,23 +52,29 @@ class Search:
     batch: SpotBatch
     holds: Holds
     options: CalibrationOptions
-    loss: Loss
+
+    def attempt(self, cell: Cell, holds: Holds | None = None) -> Solution | LasercalError:
+        """Full refinement, or why there is none: impossible start, path out of the model, ...
+
+        Raises
+        ------
+        DataError
+            The start lacks a part.
+        """
+        problem = make_graph(self.observations, self.batch, holds or self.holds, cell)
+        try:
+            return solve(problem, self.options.max_iterations)
+        except LasercalError as error:
+            return error
 
     def without(self, aside: npt.NDArray[np.bool_]) -> Search:
         """The same search with some spots (N,) left out."""
         return replace(self, batch=self.batch.weighted(~aside)) if aside.any() else self
 
     def solve_from(self, cell: Cell, holds: Holds | None = None) -> Solution | None:
-        """Full refinement; None where the start is impossible or the path leaves the model."""
-        try:
-            problem = make_graph(
-                self.observations, self.batch, holds or self.holds, cell, self.loss
-            )
-            return solve(problem, self.options.max_iterations)
-        except DataError:
-            raise
-        except LasercalError:
-            return None
+        """Full refinement, or None."""
+        result = self.attempt(cell, holds)
+        return result if isinstance(result, Solution) else None
 
 
 def refine_given(search: Search, initial: Cell) -> Solution:
@@ -78,20 +84,21 @@ def refine_given(search: Search, initial: Cell) -> Solution:
     ------
     SolveError
         The start is impossible and no staged way leads out of it.
+    DegenerateError
+        The data do not determine the cell.
     DataError
         A part is missing in ``initial``.
     """
-    direct = search.solve_from(initial)
-    if direct is not None and direct.plausible:
-        return direct
+    direct = search.attempt(initial)
+    if isinstance(direct, Solution):
+        return direct if direct.plausible else refine_candidates(search, [initial], direct)
+    if isinstance(direct, DegenerateError):
+        raise direct
     try:
-        return refine_candidates(search, [initial], direct)
+        return refine_candidates(search, [initial])
     except SolveError:
-        # report why the start itself is impossible
-        return solve(
-            make_graph(search.observations, search.batch, search.holds, initial, search.loss),
-            search.options.max_iterations,
-        )
+        # say why the start itself is impossible
+        raise SolveError(f"the given start cannot be refined: {direct}") from direct
 
 
 def refine_candidates(
@@ -103,12 +110,16 @@ def refine_candidates(
     ------
     SolveError
         No candidate could be refined at all.
+    DegenerateError
+        None could, and for one of them because the data do not determine the cell.
     """
     staged = _short_refinements(search, candidates)
     full: list[Solution] = [also] if also is not None else []
     for cell in staged:
-        solution = search.solve_from(cell)
-        if solution is None:
+        solution = search.attempt(cell)
+        if isinstance(solution, DegenerateError) and not full:
+            raise solution
+        if not isinstance(solution, Solution):
             continue
         again = any(_same_cost(solution, other) for other in full if other.plausible)
         full.append(solution)
@@ -173,24 +184,23 @@ def _short_refinements(search: Search, candidates: Sequence[Cell]) -> list[Cell]
 
 def _short(search: Search, holds: Holds, cell: Cell) -> tuple[Cell, float] | None:
     """One short refinement on the spots that are possible at its start."""
+    problem = make_graph(search.observations, search.batch, holds, cell)
+    good = ~np.isnan(search.batch.residuals(state_from_cell(problem.start))[:, 0])
+    possible = float(good[search.batch.used].mean())
+    if possible < _MIN_POSSIBLE:
+        return None
+    if possible < 1.0:
+        problem = replace(problem, batch=search.batch.weighted(good))
+    problem = problem.rescaled(_STAGE_SIGMA_PX / typical_sigma(search))
     try:
-        problem = make_graph(search.observations, search.batch, holds, cell, search.loss)
-        good = ~np.isnan(search.batch.residuals(state_from_cell(problem.start))[:, 0])
-        if good.mean() < _MIN_POSSIBLE:
-            return None
-        if not good.all():
-            problem = replace(problem, batch=search.batch.weighted(good))
-        problem = problem.rescaled(_STAGE_SIGMA_PX / _typical_sigma(search))
         solution = solve(problem, _SHORT_ITERATIONS, find_scale=False)
-    except DataError:
-        raise
     except LasercalError:
         return None
-    return solution.cell, solution.total_cost / float(good.mean())
+    return solution.cell, solution.total_cost / possible
 
 
-def _typical_sigma(search: Search) -> float:
-    """Typical a-priori pixel sigma of the batch."""
+def typical_sigma(search: Search) -> float:
+    """Typical a-priori pixel sigma of the batch (px)."""
     return float(1.0 / np.median(search.batch.spots.pixels[4]))
 
 
@@ -279,18 +289,26 @@ def _fewer_distortion_terms(
     search: Search, best: Solution, cells: Sequence[Cell]
 ) -> list[Solution]:
     """Where the full distortion gives no plausible answer: k1 only, then none, and say so."""
+    cameras = search.observations.cameras
+    prefix = "{}." if len(cameras) > 1 else ""
     for keep in (("k1",), ()):
         fewer = search.holds.without_distortion(keep)
         if np.array_equal(fewer.held, search.holds.held):
             continue
-        zeros = {t: 0.0 for t in DISTORTION_NAMES if t not in keep}
+        newly = fewer.held & ~search.holds.held
+        known, dropped = dict(fewer.known), set[str]()
+        for c, camera in enumerate(cameras):
+            first = c * len(CAMERA_TANGENT)
+            zeros = [t for t in DISTORTION_NAMES if newly[first + CAMERA_TANGENT.index(t)]]
+            known[camera] = known[camera] | dict.fromkeys(zeros, 0.0)
+            dropped |= {prefix.format(camera) + t for t in zeros}
         fewer = replace(
             fewer,
-            known={camera: zeros | values for camera, values in fewer.known.items()},
-            priors={k: v for k, v in fewer.priors.items() if k.rpartition(".")[2] not in zeros},
+            known=known,
+            priors={k: v for k, v in fewer.priors.items() if k not in dropped},
             words=(
                 *fewer.words,
-                f"{', '.join(zeros)} held at zero: fitted freely, {best.troubles[0]}",
+                f"{', '.join(sorted(dropped))} held at zero: fitted freely, {best.troubles[0]}",
             ),
         )
         found = [s for s in (search.solve_from(c, fewer) for c in cells) if s and s.plausible]
