@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, Literal, get_args
 
 from lasercal_gtsam.errors import DataError
@@ -101,11 +102,8 @@ def _number_problems(options: CalibrationOptions) -> list[str]:
 
 def _finite(value: Any) -> float:
     """The number, or NaN where it is not one (no comparison is true of NaN)."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return math.nan
-    return number if math.isfinite(number) else math.nan
+    good = isinstance(value, Real) and math.isfinite(value)
+    return float(value) if good else math.nan
 
 
 def _distortion_problems(wanted: Any) -> list[str]:
