@@ -202,7 +202,7 @@ def spot_on_beam(
         u[rows], q[rows] = beam_in_base(T_base_hand[rows], part)
     n, distance = _plane_arrays(cell, plane, count)
     length = beam_plane_distance(u, q, n, distance)
-    length = np.where(length > 0, length, np.nan)
+    length = np.where((length > 0) & (length < np.inf), length, np.nan)
     return np.asarray(q + length[:, None] * u)
 
 
@@ -217,7 +217,7 @@ def spot_on_ray(cell: Cell, uv: Array, *, plane: Names = None, camera: Names = N
     for part, rows in _select(cell.cameras, camera, len(uv), "camera"):
         rays, centre = ray_in_base(uv[rows], part), part.T_base_camera[:3, 3]
         depth = beam_plane_distance(rays, centre, n[rows], distance[rows])
-        depth = np.where(depth > 0, depth, np.nan)
+        depth = np.where((depth > 0) & (depth < np.inf), depth, np.nan)
         points[rows] = centre + depth[:, None] * rays
     return points
 
