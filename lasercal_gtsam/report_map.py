@@ -100,7 +100,8 @@ def beam_rows(beam: Beam, chart: BeamChart) -> Array:
     if chart.polar:
         angles = np.array([np.arctan2(u[1], u[0]), np.arctan2(np.hypot(u[0], u[1]), u[2])])
     else:
-        angles = np.arctan2(u[:2], u[2])
+        # atan(u / uz), so that a beam against the axis has small tilts too, not +-180 deg
+        angles = np.arctan2(np.copysign(1.0, u[2]) * u[:2], abs(u[2]))
     with np.errstate(divide="ignore", invalid="ignore"):
         crossing = np.delete(q - q[chart.axis] / u[chart.axis] * u, chart.axis)
     return np.concatenate([angles * DEG_PER_RAD, crossing * MM_PER_M])
