@@ -35,7 +35,12 @@ from lasercal_gtsam.robust import (
 )
 from lasercal_gtsam.solve import Solution, fold_warnings
 from lasercal_gtsam.start import Search, refine_candidates, refine_given
-from lasercal_gtsam.uncertainty import Uncertainty, estimate_uncertainty, table_parameters
+from lasercal_gtsam.uncertainty import (
+    Uncertainty,
+    estimate_uncertainty,
+    report_notes,
+    table_parameters,
+)
 
 if TYPE_CHECKING:
     from lasercal_gtsam.closed_form import Candidate
@@ -152,6 +157,7 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
     used = np.array([reason is None for reason in reasons])
     warnings = fold_warnings(solution.cell)
     fit = _fit(solution, uncertainty, residuals[used], int((~used).sum()), warnings)
+    notes = (*warnings, *report_notes(solution.cell, uncertainty))
     return Calibration(
         cell=cell,
         initial=start,
@@ -168,7 +174,7 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
             used.astype(np.float64),
             reasons,
         ),
-        observability=Observability(uncertainty.weak, problem.holds.words, tuple(warnings)),
+        observability=Observability(uncertainty.weak, problem.holds.words, notes),
         inputs=Inputs(observations, options),
     )
 

@@ -27,7 +27,10 @@ from lasercal_gtsam.solve import (
     degrees_of_freedom,
     refuse_if_singular,
 )
+from lasercal_gtsam.units import MM_PER_M
 
+# a plane closer to the base origin than this bends the paper's vector a
+_NEAR_ORIGIN_SIGMAS = 5.0
 # residual scale below which data are exact and say nothing about their noise
 _EXACT = 1e-6
 
@@ -92,6 +95,25 @@ def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tup
         Parameter(name, float(before), float(after), float(sigma), unit)
         for (name, unit), before, after, sigma in rows
     )
+
+
+def report_notes(cell: Cell, uncertainty: Uncertainty) -> list[str]:
+    """Rows of the table whose sigmas do not tell the whole: planes that may pass the base origin.
+
+    Their vector ``a = d n`` bends within a sigma of ``d``; normal and distance stay good.
+    """
+    where = {label: i for i, label in enumerate(uncertainty.labels)}
+    notes: list[str] = []
+    for name, plane in cell.planes.items():
+        i = where[f"plane {name}.distance"]
+        sigma = float(np.sqrt(max(uncertainty.covariance[i, i], 0.0)))
+        if plane.distance < _NEAR_ORIGIN_SIGMAS * sigma:
+            notes.append(
+                f"plane {name!r} passes the base origin at {MM_PER_M * plane.distance:.2g} +- "
+                f"{MM_PER_M * sigma:.2g} mm: do not read the sigmas of a_{name} one by one, use its "
+                "normal and distance"
+            )
+    return notes
 
 
 def _expansion(problem: CellGraph) -> Array:
