@@ -110,8 +110,8 @@ def report_notes(cell: Cell, uncertainty: Uncertainty) -> list[str]:
         if plane.distance < _NEAR_ORIGIN_SIGMAS * sigma:
             notes.append(
                 f"plane {name!r} passes the base origin at {MM_PER_M * plane.distance:.2g} +- "
-                f"{MM_PER_M * sigma:.2g} mm: do not read the sigmas of a_{name} one by one, use its "
-                "normal and distance"
+                f"{MM_PER_M * sigma:.2g} mm: do not read the sigmas of a_{name} one by one, use "
+                "its normal and distance"
             )
     return notes
 
