@@ -130,15 +130,14 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
     accept = (None,) * len(search.batch)
     plain = None if ways.suspicious else _plain(search, ways, finish)
     if isinstance(plain, Finished):
-        clean = not _outliers(plain.lengths, _unknowns(search), nobody).any()
+        clean = _looks_clean(search, plain.lengths)
         if clean and plain.solution.plausible:
             return Accepted(plain, accept, ways.starts[0])
     found = [_consensus(search, cell, cell) for cell in ways.starts[:_STARTS]]
     if isinstance(plain, Finished):
         found.append(_consensus(search, ways.starts[0], plain.solution.cell))
     best = _best(found)
-    explained = isinstance(plain, Finished) and clean and _credible(search, best)
-    if ways.parts is not None and not explained:
+    if ways.parts is not None and not (isinstance(plain, Finished) and clean):
         best = _sampled(search, ways.parts, best)
     if best is not None:
         answer = _refit(search, best, ways.refine, finish)
@@ -256,12 +255,26 @@ def _best(found: Sequence[_Consensus | None]) -> _Consensus | None:
     return min(candidates, key=lambda c: float(np.log1p((c.lengths / threshold) ** 2).sum()))
 
 
-def _credible(search: Search, best: _Consensus | None) -> bool:
+def _credible(search: Search, scale: float) -> bool:
     """Whether the residuals are as short as detected spots can make them."""
-    if best is None:
-        return False
     diagonal = max(np.hypot(*size) for size in search.observations.image_size.values())
-    return bool(best.scale * typical_sigma(search) < _CREDIBLE_SCALE * diagonal)
+    return bool(scale * typical_sigma(search) < _CREDIBLE_SCALE * diagonal)
+
+
+def _looks_clean(search: Search, lengths: Array) -> bool:
+    """No residual too long, no heavy tail, and a scale that detected spots can have.
+
+    A tail shows where many outliers agree: none stands out, but the root mean square exceeds the
+    scale that the median gives by more than chance (four standard errors).
+    """
+    unknowns = _unknowns(search)
+    if _outliers(lengths, unknowns, np.zeros(len(lengths), dtype=np.bool_)).any():
+        return False
+    scale = robust_scale(lengths, unknowns)
+    dof = max(2 * len(lengths) - unknowns, 1)
+    tail = float(np.sqrt((lengths**2).sum() / dof)) / scale
+    few = 1.0 + 4.0 * _MEDIAN_ERROR / np.sqrt(len(lengths))
+    return bool(tail < few) and _credible(search, scale)
 
 
 def _sampled(
@@ -288,7 +301,7 @@ def _sampled(
                 agreed = agreed + 1 if before and before.scale < 1.01 * best.scale else 1
         if best is None:
             continue
-        if agreed >= _AGREED and _credible(search, best):
+        if agreed >= _AGREED and _credible(search, best.scale):
             break
         clean = float(np.clip(best.share**size, 1e-12, 1.0 - 1e-12))
         if trial >= max(_MIN_PARTS, np.log(1.0 - _CONFIDENCE) / np.log1p(-clean)):
