@@ -13,7 +13,7 @@ from typing import Any
 
 from lasercal_gtsam.calibration import Calibration, Inputs, SpotResults
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.io.files import read_text, write_text
+from lasercal_gtsam.io.files import read_json, write_text
 from lasercal_gtsam.io.plain import cell_to_dict, observations_to_dict, plain, to_json
 from lasercal_gtsam.io.wording import at_most
 
@@ -117,13 +117,7 @@ def load_calibration(path: str | Path) -> Calibration:
 
 
 def _read_json(path: Path) -> Any:
-    text = read_text(path)
-    if not text.strip():
-        raise DataError(f"{path}: the file is empty")
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
+    data = read_json(path)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         found = repr(data.get("format")) if isinstance(data, dict) else f"a {type(data).__name__}"
         raise DataError(

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.io.files import read_text
+from lasercal_gtsam.io.files import read_json
 from lasercal_gtsam.io.wording import at_most
 
 FORMATS = ("lasercal-cell", "lasercal-calibration", "lasercal-truth")
 
 
-def load_cell(path: str | Path) -> Cell:
+def load_cell(path: str | Path, formats: tuple[str, ...] = FORMATS) -> Cell:
     """Read the cameras, lasers and planes of a JSON file.
 
     The keys are those of ``calibration.json`` (metres, pixels, units in the names); everything
     else in the file is ignored. A ``matrix`` beside translation and quaternion may be left out.
+    ``formats``: what the file may state to be (stating nothing means the first of `FORMATS`).
 
     Raises
     ------
@@ -31,18 +31,12 @@ def load_cell(path: str | Path) -> Cell:
     from lasercal_gtsam.io.schema import dotted, validation_problems
 
     path = Path(path)
-    text = read_text(path)
-    if not text.strip():
-        raise DataError(f"{path}: the file is empty")
-    try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
+    data = read_json(path)
     kind = data.get("format", FORMATS[0]) if isinstance(data, dict) else None
-    if kind not in FORMATS or data.get("version", 1) != 1:
+    if kind not in formats or data.get("version", 1) != 1:
         raise DataError(
             f"{path}: expected a mapping with cameras, lasers and planes, and if it states a "
-            f"format, one of {', '.join(FORMATS)}, version 1"
+            f"format, one of {', '.join(formats)}, version 1"
         )
     problems: list[str] = []
     try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from lasercal_gtsam.errors import DataError
 
@@ -32,6 +34,17 @@ def read_text(path: str | Path) -> str:
             f"{path}:{line}: byte {content[error.start]:#04x} is not UTF-8 text; save the file as "
             "UTF-8"
         ) from None
+
+
+def read_json(path: Path) -> Any:
+    """Content of a JSON file; DataError with line and column where it is none."""
+    text = read_text(path)
+    if not text.strip():
+        raise DataError(f"{path}: the file is empty")
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
 
 
 def read_bytes(path: str | Path) -> bytes:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -124,28 +123,10 @@ def load_truth(path: str | Path) -> Cell:
     DataError
         The file is missing or holds no truth.
     """
-    from pydantic import ValidationError
-
-    from lasercal_gtsam.io.calibration_model import CellModel
-    from lasercal_gtsam.io.files import read_text
-    from lasercal_gtsam.io.schema import dotted, validation_problems
+    from lasercal_gtsam.io.cell_file import load_cell
 
     path = Path(path) / TRUTH_FILE if Path(path).is_dir() else Path(path)
-    try:
-        data = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
-    if not isinstance(data, dict) or data.get("format") != TRUTH_FORMAT:
-        raise DataError(f"{path}: expected a mapping with format {TRUTH_FORMAT!r}")
-    problems: list[str] = []
-    cell = None
-    try:
-        cell = CellModel.model_validate(data).build_cell("", problems)
-    except ValidationError as error:
-        problems += [f"{dotted(at)}: {text}" for at, text in validation_problems(error, CellModel)]
-    if cell is None:
-        raise DataError(*(f"{path}: {text}" for text in problems))
-    return cell
+    return load_cell(path, formats=(TRUTH_FORMAT,))
 
 
 def _patterns(pictures: PictureOptions | None) -> dict[str, Any] | None:
