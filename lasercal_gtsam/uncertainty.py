@@ -73,7 +73,9 @@ def estimate_uncertainty(solution: Solution) -> Uncertainty:
     sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
     unit = sigma0 / problem.scale
     E = _expansion(problem)
-    covariance = unit**2 * (E @ svd.covariance() @ E.T)
+    covariance = E @ (unit**2 * svd.covariance()) @ E.T
+    covariance[~E.any(axis=1)] = 0.0  # what is held has none, even where the scale is unknown
+    covariance[:, ~E.any(axis=1)] = 0.0
     weak = svd.weak_directions(sigma=unit if unit > _EXACT else 1.0)
     return Uncertainty(covariance, tangent_labels(solution.cell), sigma0, dof, weak)
 
@@ -82,7 +84,10 @@ def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tup
     """Rows of the paper's Table 2 with sigmas by exact change of variables."""
     charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
     F = row_jacobian(cell, charts, beam_frames(cell))
-    variances = np.einsum("ij,jk,ik->i", F, uncertainty.covariance, F, optimize=True)
+    covariance = uncertainty.covariance
+    unknown = np.isnan(np.diag(covariance))
+    variances = np.einsum("ij,jk,ik->i", F, np.nan_to_num(covariance), F, optimize=True)
+    variances[F[:, unknown].any(axis=1)] = np.nan
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     rows = zip(
         row_names(cell, charts),
