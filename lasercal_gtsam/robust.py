@@ -267,14 +267,12 @@ def _looks_clean(search: Search, lengths: Array) -> bool:
     A tail shows where many outliers agree: none stands out, but the root mean square exceeds the
     scale that the median gives by more than chance (four standard errors).
     """
-    unknowns = _unknowns(search)
-    if _outliers(lengths, unknowns, np.zeros(len(lengths), dtype=np.bool_)).any():
-        return False
+    count, unknowns = len(lengths), _unknowns(search)
     scale = robust_scale(lengths, unknowns)
-    dof = max(2 * len(lengths) - unknowns, 1)
-    tail = float(np.sqrt((lengths**2).sum() / dof)) / scale
-    few = 1.0 + 4.0 * _MEDIAN_ERROR / np.sqrt(len(lengths))
-    return bool(tail < few) and _credible(search, scale)
+    if not lengths.max() <= rejection_length(count) * scale:
+        return False
+    tail = float(np.sqrt(lengths @ lengths / max(2 * count - unknowns, 1))) / scale
+    return tail < 1.0 + 4.0 * _MEDIAN_ERROR / np.sqrt(count) and _credible(search, scale)
 
 
 def _sampled(

@@ -87,7 +87,8 @@ def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tup
     covariance = uncertainty.covariance
     unknown = np.isnan(np.diag(covariance))
     variances = np.einsum("ij,jk,ik->i", F, np.nan_to_num(covariance), F, optimize=True)
-    variances[F[:, unknown].any(axis=1)] = np.nan
+    if unknown.any():
+        variances[F[:, unknown].any(axis=1)] = np.nan
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     rows = zip(
         row_names(cell, charts),
