@@ -50,6 +50,19 @@ def rotation_exp(w: Array) -> Array:
     return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * W + 0.5 * half**2 * (W @ W))
 
 
+def rotation_log(R: Array) -> Array:
+    """Rotation vector (3,) of a rotation matrix, radians, at most pi long."""
+    sine = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    s, c = float(np.linalg.norm(sine)), 0.5 * (float(np.trace(R)) - 1.0)
+    angle = float(np.arctan2(s, c))
+    if c > -0.99:
+        return sine * (angle / s if s > 1e-9 else 1.0)
+    # near half a turn the sine is lost: the axis spans the symmetric part's largest column
+    axis = (R + R.T + (1.0 - float(np.trace(R))) * np.eye(3))[:, int(np.argmax(np.diag(R)))]
+    axis = axis / np.linalg.norm(axis)
+    return np.asarray(angle * (axis if axis @ sine >= 0 else -axis))
+
+
 def nearest_rotation(M: Array) -> Array:
     """Closest rotation matrix in the Frobenius norm (stacks allowed, shape (..., 3, 3))."""
     U, _, Vt = np.linalg.svd(M)
