@@ -63,6 +63,21 @@ def read_rows(head: CaptureHead, folder: Path) -> Rows:
         With every problem of both files, each with file, line and column.
     """
     poses = read_table(folder / head.poses.file, head.poses.file)
+    spots = None
+    if head.spots is not None:
+        spots = read_table(folder / head.spots.file, head.spots.file)
+    rows = rows_of(head, poses, spots)
+    problems = [*poses.problems(), *(spots.problems() if spots else [])]
+    if problems:
+        raise DataError(*problems)
+    return rows
+
+
+def rows_of(head: CaptureHead, poses: Table, spots: Table | None) -> Rows:
+    """Take the rows out of the tables; what is wrong is noted in the tables.
+
+    Rows with problems hold placeholders: whoever reads asks the tables.
+    """
     count = len(poses)
     warnings: list[str] = []
     ids = poses.unique("id") if poses.require(["id"], "which names each row") else [""] * count
@@ -74,18 +89,13 @@ def read_rows(head: CaptureHead, folder: Path) -> Rows:
     uv, cov = _spots(poses, [sizes.get(name) for name in cameras])
     verdict = [USED if given else "" for given in _complete(uv)]
     reason = [""] * count
-    problems = poses.problems()
-    if head.spots is not None:
-        spots = read_table(folder / head.spots.file, head.spots.file)
+    if spots is not None:
         if "u" in poses.columns:
             poses.add_file_problem(
-                f"spots are given here (columns u, v) and in {head.spots.file}; drop one of them"
+                f"spots are given here (columns u, v) and in {spots.name}; drop one of them"
             )
         size_of = {i: sizes.get(camera) for i, camera in zip(ids, cameras, strict=True)}
         _merge_spots(spots, ids, size_of, (uv, cov, verdict, reason), poses)
-        problems = [*poses.problems(), *spots.problems()]
-    if problems:
-        raise DataError(*problems)
     return Rows(
         ids=ids,
         planes=planes,

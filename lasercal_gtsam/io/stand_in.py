@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,8 @@ from lasercal_gtsam.io.pictures import Picture
 
 MIN_ROWS = 5
 MAX_PICTURES = 15
+WITHOUT = "looked at without an off frame"
+_ALONE = "without an off frame every bright thing looks like a spot"
 
 Scene = tuple[str, str]
 
@@ -75,7 +77,7 @@ class StandIns:
         frame, remark = made.frame, made.remark
         if frame is not None and (frame.shape, frame.dtype) != (on.shape, on.dtype):
             remark = (
-                f"looked at without an off frame: the picture is {on.dtype} {on.shape}, those of "
+                f"{WITHOUT}: the picture is {on.dtype} {on.shape}, those of "
                 f"the other rows are {frame.dtype} {frame.shape}"
             )
             frame = None
@@ -84,9 +86,6 @@ class StandIns:
         return frame
 
     def _make(self, scene: Scene) -> StandIn:
-        from lasercal_gtsam.detect.options import DetectionOptions
-        from lasercal_gtsam.detect.reference import median_frame, spots_in_median
-
         rows = self._rows[scene]
         if len(rows) < MIN_ROWS:
             return _NOTHING
@@ -94,26 +93,34 @@ class StandIns:
             pictures = [self._read(row) for row in evenly(rows)]
         except DataError:
             return _NOTHING  # the row itself will say so
-        try:
-            frame = median_frame(pictures)
-            options = DetectionOptions(saturation_level=self._saturation)
-            why = spots_in_median(frame, pictures, options)
-        except DetectionError as error:
-            why = str(error)
+        frame, why = median_of(pictures, self._saturation)
         about = f"{_named(scene)}: {len(rows)} rows have no laser-off picture"
         if why is not None:
             self.notes.append(
                 f"{about}, and the median of their laser-on pictures cannot stand in for it "
                 f"({why}); {_ALONE}"
             )
-            return StandIn(None, f"looked at without an off frame: {why}")
+            return StandIn(None, f"{WITHOUT}: {why}")
         self.notes.append(
             f"{about}; the median of {len(pictures)} of their laser-on pictures stands in for it"
         )
         return StandIn(frame, f"off frame: median of {len(pictures)} laser-on pictures")
 
 
-_ALONE = "without an off frame every bright thing looks like a spot"
+def median_of(
+    pictures: Sequence[Picture], saturation: float | None
+) -> tuple[Picture | None, str | None]:
+    """The median of laser-on pictures of a scene, or None and why it cannot stand in."""
+    from lasercal_gtsam.detect.options import DetectionOptions
+    from lasercal_gtsam.detect.reference import median_frame, spots_in_median
+
+    try:
+        frame = median_frame(pictures)
+        options = DetectionOptions(saturation_level=saturation)
+        why = spots_in_median(frame, pictures, options)
+    except DetectionError as error:
+        why = str(error)
+    return (frame, None) if why is None else (None, why)
 
 
 def evenly(rows: list[int]) -> list[int]:

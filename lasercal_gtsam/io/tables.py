@@ -17,6 +17,8 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.files import read_text
 from lasercal_gtsam.io.wording import at_most, nearest, some
 
+Row = tuple[int, list[str]]
+
 
 @dataclass
 class Table:
@@ -52,6 +54,13 @@ class Table:
     def add_file_problem(self, text: str) -> None:
         """Note what is wrong with the file as a whole."""
         self._problems.append((0, text))
+
+    def problems_by_line(self) -> dict[int, list[str]]:
+        """Problems so far by line; those of the file as a whole under 0."""
+        by_line: dict[int, list[str]] = {}
+        for line, text in self._problems:
+            by_line.setdefault(line, []).append(text)
+        return by_line
 
     def problems(self) -> list[str]:
         """Every problem so far with file and line, in the order of the lines."""
@@ -163,10 +172,29 @@ def read_table(path: Path, name: str | None = None) -> Table:
         raise DataError(
             f"{name}: the file is empty; expected a line of column names and rows of numbers"
         )
-    (header_line, header), body = rows[0], rows[1:]
-    _check_separator(header, f"{name}:{header_line}")
-    whole = [(line, cells) for line, cells in body if len(cells) == len(header)]
-    names = [cell.strip().lower() for cell in header]
+    table = table_of(rows[0], rows[1:], name)
+    if len(rows) == 1:
+        table.add_file_problem("there are column names but no rows")
+    return table
+
+
+def table_of(header: Row, body: Sequence[Row], name: str) -> Table:
+    """Table of rows that are already split into cells.
+
+    Parameters
+    ----------
+    header, body : line number and cells, of the column names and of the rows
+    name : what messages call the file
+
+    Raises
+    ------
+    DataError
+        The header is none; what else is wrong is only noted, as in `read_table`.
+    """
+    header_line, titles = header
+    _check_separator(titles, f"{name}:{header_line}")
+    whole = [(line, cells) for line, cells in body if len(cells) == len(titles)]
+    names = [cell.strip().lower() for cell in titles]
     columns: dict[str, list[str]] = {}
     for k, column in enumerate(names):
         columns.setdefault(column, [cells[k].strip() for _, cells in whole])
@@ -176,21 +204,19 @@ def read_table(path: Path, name: str | None = None) -> Table:
         lines=[line for line, _ in whole],
         whole=len(whole) == len(body),
     )
-    if not body:
-        table.add_file_problem("there are column names but no rows")
     for text in _repeated_columns(names):
         table.add_problem_in_line(header_line, text)
     for line, cells in body:
-        if len(cells) != len(header):
-            hint = "; is there a decimal comma?" if len(cells) > len(header) else ""
+        if len(cells) != len(titles):
+            hint = "; is there a decimal comma?" if len(cells) > len(titles) else ""
             table.add_problem_in_line(
-                line, f"{len(cells)} cells, expected {len(header)} as in the first line{hint}"
+                line, f"{len(cells)} cells, expected {len(titles)} as in the first line{hint}"
             )
     columns.pop("", None)
     return table
 
 
-def _rows(text: str, name: str) -> list[tuple[int, list[str]]]:
+def _rows(text: str, name: str) -> list[Row]:
     """Rows that are not blank, with their line numbers."""
     reader = csv.reader(io.StringIO(text, newline=None), strict=True, skipinitialspace=True)
     try:
