@@ -21,7 +21,7 @@ from lasercal_gtsam.errors import DataError, DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
 from lasercal_gtsam.hand_noise import refine_with_hand_noise
-from lasercal_gtsam.holds import resolve_holds
+from lasercal_gtsam.holds import Holds, resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.robust import (
@@ -103,14 +103,12 @@ def _given_start(initial: Cell) -> Ways:
     return Ways([initial], lambda search, cells: refine_given(search, cells[0]))
 
 
-def _closed_form_starts(search: Search) -> Ways:
-    """Starts from the data alone, told what is known of the cameras and of the robot."""
-    from lasercal_gtsam.closed_form import closed_form_candidates
+def closed_form_hints(holds: Holds, options: CalibrationOptions) -> dict[str, Any]:
+    """What is known of the cameras and of the robot, as arguments of `closed_form_candidates`."""
     from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD
 
-    holds, options = search.holds, search.options
     known = holds.known.items()
-    hints: dict[str, Any] = {
+    return {
         "principal_point": {c: (k["u0"], k["v0"]) for c, k in known if {"u0", "v0"} <= set(k)},
         "skew": {c: k["skew"] for c, k in known if "skew" in k},
         "aspect": holds.aspect,
@@ -118,6 +116,14 @@ def _closed_form_starts(search: Search) -> Ways:
         # hand poses that are read back differ by the robot's noise (method 3.1)
         "group_tolerance_rad": max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad),
     }
+
+
+def _closed_form_starts(search: Search) -> Ways:
+    """Starts from the data alone, told what is known of the cameras and of the robot."""
+    from lasercal_gtsam.closed_form import closed_form_candidates
+
+    holds, options = search.holds, search.options
+    hints = closed_form_hints(holds, options)
     failure: DegenerateError | None = None
     found: Sequence[Candidate] = ()
     try:

@@ -133,9 +133,9 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
         clean = _looks_clean(search, plain.lengths)
         if clean and plain.solution.plausible:
             return Accepted(plain, accept, ways.starts[0])
-    found = [_consensus(search, cell, cell) for cell in ways.starts[:_STARTS]]
+    found = [consensus(search, cell, cell) for cell in ways.starts[:_STARTS]]
     if isinstance(plain, Finished):
-        found.append(_consensus(search, ways.starts[0], plain.solution.cell))
+        found.append(consensus(search, ways.starts[0], plain.solution.cell))
     best = _best(found)
     if ways.parts is not None and not (isinstance(plain, Finished) and clean):
         best = _sampled(search, ways.parts, best)
@@ -197,7 +197,7 @@ def parts_of(
 
 
 @dataclass(frozen=True)
-class _Consensus:
+class Consensus:
     """Where the Cauchy loss ended: the cell, the scale of its residuals and their lengths."""
 
     start: Cell
@@ -212,7 +212,7 @@ class _Consensus:
         return float(np.mean(self.lengths <= rejection_length(len(self.lengths)) * self.scale))
 
 
-def _consensus(search: Search, start: Cell, cell: Cell) -> _Consensus | None:
+def consensus(search: Search, start: Cell, cell: Cell) -> Consensus | None:
     """Minimise the Cauchy loss from ``cell``, which came from ``start``.
 
     The threshold follows the scale of the residuals downwards. The distortion stays where it is
@@ -243,10 +243,10 @@ def _consensus(search: Search, start: Cell, cell: Cell) -> _Consensus | None:
             iterations += found.iterations
             if abs(robust_scale(lengths, unknowns) - scale) < 0.01 * scale:
                 break
-    return _Consensus(start, cell, robust_scale(lengths, unknowns), lengths, iterations)
+    return Consensus(start, cell, robust_scale(lengths, unknowns), lengths, iterations)
 
 
-def _best(found: Sequence[_Consensus | None]) -> _Consensus | None:
+def _best(found: Sequence[Consensus | None]) -> Consensus | None:
     """The consensus with the smallest Cauchy loss at the smallest scale of all."""
     candidates = [c for c in found if c is not None]
     if not candidates:
@@ -278,8 +278,8 @@ def _looks_clean(search: Search, lengths: Array) -> bool:
 def _sampled(
     search: Search,
     parts: Iterator[tuple[Cell, int] | None],
-    best: _Consensus | None,
-) -> _Consensus | None:
+    best: Consensus | None,
+) -> Consensus | None:
     """Best consensus over random parts, as many as the share of outliers asks for."""
     lowest, refused, agreed = np.inf, 0, 0
     for trial, part in enumerate(parts, start=1):
@@ -293,7 +293,7 @@ def _sampled(
         middle = float(np.median(lengths_of(search, start)))
         if np.isfinite(middle) and middle <= 2.0 * lowest:
             lowest = min(lowest, middle)
-            found = _consensus(search, start, start)
+            found = consensus(search, start, start)
             before, best = best, _best([best, found])
             if found is not None and best is not None and found.scale < 1.01 * best.scale:
                 agreed = agreed + 1 if before and before.scale < 1.01 * best.scale else 1
@@ -308,7 +308,7 @@ def _sampled(
 
 
 def _refit(
-    search: Search, best: _Consensus, refine: Refine, finish: Finish
+    search: Search, best: Consensus, refine: Refine, finish: Finish
 ) -> tuple[Finished, Mask] | None:
     """Plain least squares without the outliers, until the same spots stay out.
 
