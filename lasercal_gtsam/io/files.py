@@ -53,7 +53,7 @@ def read_bytes(path: str | Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise DataError(f"{path}: {_reason(error)}") from None
+        raise DataError(f"{path}: {reason_of(error)}") from None
 
 
 def sha256_of(path: str | Path) -> str:
@@ -100,7 +100,7 @@ def replacing(path: str | Path) -> Iterator[Path]:
         temporary = None
         _flush(target.parent)
     except OSError as error:
-        raise DataError(f"{path}: cannot be written: {_reason(error)}") from None
+        raise DataError(f"{path}: cannot be written: {reason_of(error)}") from None
     finally:
         if temporary is not None:
             with suppress(OSError):
@@ -122,7 +122,8 @@ def _flush(path: Path) -> None:
         os.close(handle)
 
 
-def _reason(error: OSError) -> str:
+def reason_of(error: OSError) -> str:
+    """What is wrong with a file, in words."""
     if isinstance(error, FileNotFoundError):
         return "there is no such file or folder"
     if isinstance(error, IsADirectoryError):
