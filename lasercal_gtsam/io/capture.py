@@ -174,13 +174,7 @@ class Capture(FrozenData):
         ``overrides`` are fields of `CalibrationOptions` and win over the capture; ``known`` is
         merged name by name.
         """
-        known = {**self.known, **overrides.pop("known", {})}
-        stated = {
-            "sigma_px": self.noise.sigma_px,
-            "hand_sigma_m": self.noise.hand_sigma_m,
-            "hand_sigma_rad": self.noise.hand_sigma_rad,
-        }
-        return CalibrationOptions(**{**stated, **overrides, "known": known})
+        return stated_options(self.noise, self.known, **overrides)
 
     def _default_detector(self) -> Detector:
         from lasercal_gtsam.detect.options import DetectionOptions
@@ -252,7 +246,7 @@ def load_capture(path: str | Path) -> Capture:
     from lasercal_gtsam.io.capture_head import read_head
     from lasercal_gtsam.io.capture_rows import read_rows
 
-    path = _capture_file(Path(path))
+    path = capture_file(Path(path))
     folder = path.parent
     head, lines = read_head(path)
     rows = read_rows(head, folder)
@@ -262,7 +256,7 @@ def load_capture(path: str | Path) -> Capture:
             "spots: {file: spots.csv}, or images: images/{id}.png"
         )
     on, off, image_warnings = _pictures(head, rows, folder, path.name, lines)
-    noise, noise_warnings = _noise(head, path.name)
+    noise, noise_warnings = stated_noise(head, path.name)
     files = [head.poses.file, *([head.spots.file] if head.spots else [])]
     return Capture(
         path=path,
@@ -280,10 +274,7 @@ def load_capture(path: str | Path) -> Capture:
         images_off=off,
         saturation=head.images.saturation if head.images else None,
         noise=noise,
-        known={
-            key: tuple(value) if isinstance(value, list) else value
-            for key, value in head.known.items()
-        },
+        known=known_values(head),
         provenance={path.name: sha256_of(path), **{f: sha256_of(folder / f) for f in files}},
         warnings=(
             *rows.warnings,
@@ -294,7 +285,21 @@ def load_capture(path: str | Path) -> Capture:
     )
 
 
-def _capture_file(path: Path) -> Path:
+def stated_options(
+    noise: CaptureNoise, known: Mapping[str, Any], **overrides: Any
+) -> CalibrationOptions:
+    """Options with stated noise and known values; see `Capture.options`."""
+    stated = {
+        "sigma_px": noise.sigma_px,
+        "hand_sigma_m": noise.hand_sigma_m,
+        "hand_sigma_rad": noise.hand_sigma_rad,
+    }
+    merged = {**known, **overrides.pop("known", {})}
+    return CalibrationOptions(**{**stated, **overrides, "known": merged})
+
+
+def capture_file(path: Path) -> Path:
+    """``capture.yaml`` of a path, which is that file or its folder."""
     if not path.is_dir():
         return path
     if (path / CAPTURE_FILE).is_file():
@@ -318,7 +323,15 @@ def _pictures(
     return find_pictures(patterns, folder, columns, needed, places)
 
 
-def _noise(head: CaptureHead, name: str) -> tuple[CaptureNoise, list[str]]:
+def known_values(head: CaptureHead) -> dict[str, Any]:
+    """What ``capture.yaml`` holds fixed, in the form of `CalibrationOptions.known`."""
+    return {
+        key: tuple(value) if isinstance(value, list) else value for key, value in head.known.items()
+    }
+
+
+def stated_noise(head: CaptureHead, name: str) -> tuple[CaptureNoise, list[str]]:
+    """The noise that ``capture.yaml`` states, and warnings about it."""
     said = head.noise
     if said is None:
         return CaptureNoise(), []
