@@ -1,0 +1,427 @@
+"""Compiled steps of a running calibration: stored spots in, information out, some at a time.
+
+A stored spot is one row of 14 numbers (112 bytes): pixel ``u, v``; ``w00, w01, w11`` of the upper
+triangle ``W`` with ``W.T @ W = inv(cov_uv)``; the first two columns of the hand's rotation and its
+translation (``T_base_hand``, metres). Beside it: the number of its *path* (which camera, laser and
+plane it went by) and whether the estimate uses it.
+
+A `View` is a cell in chart coordinates, at one point: whatever is linearised, is linearised there.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from lasercal_factors.arrays import Array, Index, Spots, State
+from lasercal_factors.chart_kernels import move, normal_map, rotation
+from lasercal_factors.kernels import cholesky, constrain, information, jit, residuals, rows
+
+RECORD = 14
+LEFT_OUT, USED, HELD_BACK = 0, 1, 2
+_HAND_ROUNDS = 2
+
+
+class View(NamedTuple):
+    """A cell at one point of its chart.
+
+    state : the cell; M (n, n): a step of the chart's coordinates to the step that `kernels.rows`
+    differentiates by; paths (P, 3): camera, laser, plane index of each path; offsets (P, 4): first
+    column of camera pose, intrinsics, beam and plane of each path.
+    """
+
+    state: State
+    M: Array
+    paths: Index
+    offsets: Index
+
+
+class Weighing(NamedTuple):
+    """What else weighs a spot.
+
+    hand (6,): variances of a hand pose, translation in base (m^2), rotation in hand (rad^2);
+    fade: factor on a spot's information for each spot that came after it.
+    """
+
+    hand: Array
+    fade: float
+
+
+@jit
+def row_map(z, reference, state):
+    """(n, n): a step of the chart's coordinates at ``z`` to one of the rows' coordinates there.
+
+    As `chart.CellChart.tangent_map`, and the rows' offset of a plane is GTSAM's, ``-d``.
+    """
+    M = np.eye(len(z))
+    at = 0
+    for _ in range(len(reference.cam_R)):
+        turn, right = rotation(z[at : at + 3])
+        M[at : at + 3, at : at + 3] = right
+        M[at + 3 : at + 6, at + 3 : at + 6] = turn.T
+        at += 15
+    at += 4 * len(reference.beam_l)
+    for p in range(len(reference.plane_d)):
+        tilt = z[at : at + 2]
+        M[at : at + 2, at : at + 2] = normal_map(reference.plane_n[p], state.plane_n[p], tilt)
+        M[at + 2, at + 2] = -1.0
+        at += 3
+    return M
+
+
+@jit
+def view_at(z, aspects, reference, paths, offsets):
+    """The `View` at chart coordinates ``z``."""
+    state = move(z, aspects, reference)
+    return View(state, row_map(z, reference, state), paths, offsets)
+
+
+@jit
+def gather(records, path, view):
+    """Spots for the kernels, sorted by path; the row of each; the offsets of each block."""
+    count, most = len(records), len(view.paths)
+    first = np.zeros(most + 1, np.int64)
+    for i in range(count):
+        first[path[i] + 1] += 1
+    present = 0
+    for p in range(most):
+        present += 1 if first[p + 1] > 0 else 0
+        first[p + 1] += first[p]
+    blocks, offsets = np.empty((present, 5), np.int64), np.empty((present, 4), np.int64)
+    m = 0
+    for p in range(most):
+        if first[p + 1] > first[p]:
+            blocks[m, :3] = view.paths[p]
+            blocks[m, 3], blocks[m, 4] = first[p], first[p + 1]
+            offsets[m] = view.offsets[p]
+            m += 1
+    pixels, hands = np.empty((5, count)), np.empty((12, count))
+    order = np.empty(count, np.int64)
+    for i in range(count):
+        k = first[path[i]]
+        first[path[i]] += 1
+        order[k] = i
+        r = records[i]
+        for j in range(5):
+            pixels[j, k] = r[j]
+        for j in range(3):
+            a, b = (j + 1) % 3, (j + 2) % 3
+            hands[3 * j, k] = r[5 + j]
+            hands[3 * j + 1, k] = r[8 + j]
+            hands[3 * j + 2, k] = r[5 + a] * r[8 + b] - r[5 + b] * r[8 + a]
+            hands[9 + j, k] = r[11 + j]
+    return Spots(pixels, hands, blocks), order, offsets
+
+
+@jit
+def _by_hand(hand, block, state):
+    """Predicted pixel of one hand pose (12,), and its derivative by the pose, (2, 6).
+
+    By the translation in the base, then by the rotation in the hand (method 3.1, chain of 1-9).
+    """
+    c, l, p = block[0], block[1], block[2]  # noqa: E741
+    L, line = state.beam_R[l], state.beam_l[l]
+    R, t, K = state.cam_R[c], state.cam_t[c], state.cam_K[c]
+    n = state.plane_n[p]
+    u, q, b, x = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for i in range(3):
+        u[i] = L[i, 0] * line[0] + L[i, 1] * line[1] + L[i, 2]
+        q[i] = state.beam_t[l, i] + L[i, 0] * line[2] + L[i, 1] * line[3]
+    for i in range(3):
+        b[i] = hand[3 * i] * u[0] + hand[3 * i + 1] * u[1] + hand[3 * i + 2] * u[2]
+        x[i] = hand[3 * i] * q[0] + hand[3 * i + 1] * q[1] + hand[3 * i + 2] * q[2] + hand[9 + i]
+    nb = n[0] * b[0] + n[1] * b[1] + n[2] * b[2]
+    s = (state.plane_d[p] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])) / nb
+    y = np.empty(3)
+    for i in range(3):
+        y[i] = 0.0
+        for j in range(3):
+            y[i] += R[j, i] * (x[j] + s * b[j] - t[j])
+    a0, a1 = y[0] / y[2], y[1] / y[2]
+    k1, k2, p1, p2 = K[5], K[6], K[7], K[8]
+    r2 = a0 * a0 + a1 * a1
+    g, dg = 1.0 + r2 * (k1 + k2 * r2), k1 + 2.0 * k2 * r2
+    xd = g * a0 + 2.0 * p1 * a0 * a1 + p2 * (r2 + 2.0 * a0 * a0)
+    yd = g * a1 + p1 * (r2 + 2.0 * a1 * a1) + 2.0 * p2 * a0 * a1
+    uv = np.array([K[0] * xd + K[2] * yd + K[3], K[1] * yd + K[4]])
+    d00 = g + 2.0 * a0 * a0 * dg + 2.0 * p1 * a1 + 6.0 * p2 * a0
+    d01 = 2.0 * a0 * a1 * dg + 2.0 * p1 * a0 + 2.0 * p2 * a1
+    d11 = g + 2.0 * a1 * a1 * dg + 6.0 * p1 * a1 + 2.0 * p2 * a0
+    B = np.empty((2, 6))
+    for row in range(2):
+        if row == 0:
+            e0 = (K[0] * d00 + K[2] * d01) / y[2]
+            e1 = (K[0] * d01 + K[2] * d11) / y[2]
+        else:
+            e0, e1 = K[1] * d01 / y[2], K[1] * d11 / y[2]
+        e2 = -(e0 * a0 + e1 * a1)
+        along = 0.0
+        for i in range(3):
+            B[row, i] = R[i, 0] * e0 + R[i, 1] * e1 + R[i, 2] * e2
+            along += B[row, i] * b[i]
+        for i in range(3):
+            B[row, i] -= along / nb * n[i]
+        # a point s of the hand moves by R_hand (w x s): row . that = (s x (row R_hand)) . w
+        h = np.empty(3)
+        for j in range(3):
+            h[j] = B[row, 0] * hand[j] + B[row, 1] * hand[3 + j] + B[row, 2] * hand[6 + j]
+        for j in range(3):
+            v, w = (j + 1) % 3, (j + 2) % 3
+            B[row, 3 + j] = (q[v] + s * u[v]) * h[w] - (q[w] + s * u[w]) * h[v]
+    return uv, B
+
+
+@jit
+def _moved_hand(hand, eta):
+    """The hand pose (12,) corrected by ``eta`` (6,): translation in base, rotation in hand."""
+    turn, _ = rotation(eta[3:])
+    out = np.empty(12)
+    for i in range(3):
+        for j in range(3):
+            out[3 * i + j] = 0.0
+            for k in range(3):
+                out[3 * i + j] += hand[3 * i + k] * turn[k, j]
+        out[9 + i] = hand[9 + i] + eta[i]
+    return out
+
+
+@jit
+def correct_hands(spots, state, hand):
+    """Move every hand pose to where it most likely was, in place; `hand_noise` has the method.
+
+    Residuals become ``r - B eta`` and the whitening that of ``cov_uv + B Sigma B^T``.
+    """
+    for block in spots.blocks:
+        for k in range(block[3], block[4]):
+            w00, w01, w11 = spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k]
+            # inverse of W^T W
+            c11 = 1.0 / (w11 * w11)
+            c01 = -w01 / (w00 * w11 * w11)
+            c00 = 1.0 / (w00 * w00) + w01 * w01 / (w00 * w00 * w11 * w11)
+            commanded = spots.hands[:, k].copy()
+            eta, moved, at = np.zeros(6), commanded, commanded
+            last = (c00, c01, c11, 1.0, 0.0, 0.0)
+            good = True
+            for _ in range(_HAND_ROUNDS + 1):
+                uv, B = _by_hand(moved, block, state)
+                s00, s01, s11 = c00, c01, c11
+                r0, r1 = uv[0] - spots.pixels[0, k], uv[1] - spots.pixels[1, k]
+                for j in range(6):
+                    s00 += B[0, j] * hand[j] * B[0, j]
+                    s01 += B[0, j] * hand[j] * B[1, j]
+                    s11 += B[1, j] * hand[j] * B[1, j]
+                    r0 -= B[0, j] * eta[j]
+                    r1 -= B[1, j] * eta[j]
+                det = s00 * s11 - s01 * s01
+                good = math.isfinite(det) and math.isfinite(r0) and math.isfinite(r1)
+                if not good:
+                    break
+                shift0 = shift1 = 0.0
+                for j in range(6):
+                    shift0 += B[0, j] * eta[j]
+                    shift1 += B[1, j] * eta[j]
+                last = (s00, s01, s11, det, shift0, shift1)
+                at = moved
+                g0, g1 = (s11 * r0 - s01 * r1) / det, (s00 * r1 - s01 * r0) / det
+                eta = np.empty(6)
+                for j in range(6):
+                    eta[j] = -hand[j] * (B[0, j] * g0 + B[1, j] * g1)
+                moved = _moved_hand(commanded, eta)
+            if not good:
+                continue
+            s00, s01, s11, det, shift0, shift1 = last
+            spots.hands[:, k] = at
+            spots.pixels[0, k] += shift0
+            spots.pixels[1, k] += shift1
+            w00 = math.sqrt(s11 / det)
+            spots.pixels[2, k] = w00
+            spots.pixels[3, k] = -s01 / (det * w00)
+            spots.pixels[4, k] = 1.0 / math.sqrt(s11)
+
+
+@jit
+def squared_lengths(spots, state):
+    """Squared whitened residual length of every spot, (N,), and squared pixels; inf where none."""
+    r = residuals(spots, state)
+    whitened, pixels = np.empty(len(r)), np.empty(len(r))
+    for k in range(len(r)):
+        du, dv = r[k]
+        e0 = spots.pixels[2, k] * du + spots.pixels[3, k] * dv
+        e1 = spots.pixels[4, k] * dv
+        m = e0 * e0 + e1 * e1
+        whitened[k] = m if math.isfinite(m) else np.inf
+        pixels[k] = du * du + dv * dv
+    return whitened, pixels
+
+
+@jit
+def accumulate(records, path, mark, view, noise, limit, judge, age):
+    """Information of some stored spots, linearised at a view.
+
+    Parameters
+    ----------
+    records (m, 14), path (m,), mark (m,) : as stored
+    limit : length in a-priori sigmas beyond which a spot is an outlier
+    judge : renew ``mark``, where it is not `HELD_BACK`: `USED` within the limit, else `LEFT_OUT`
+    age : how many spots came after the first of these
+
+    Returns
+    -------
+    H (n+1, n+1) : ``[J r]^T [J r]`` over the used spots in chart coordinates; [0, 0] NaN where a
+        used spot cannot be
+    sums (3,) : weight of the used spots (their number, if nothing fades); their squared pixel
+        residuals, px^2; the loss: squared whitened lengths, no more than the limit's for each spot
+        that is not held back
+    """
+    everyone, order, offsets = gather(records, path, view)
+    if np.any(noise.hand > 0.0):
+        correct_hands(everyone, view.state, noise.hand)
+    lengths2, pixels2 = squared_lengths(everyone, view.state)
+    blocks, kept = everyone.blocks.copy(), 0
+    sums = np.zeros(3)
+    for m in range(len(blocks)):
+        first = kept
+        for k in range(everyone.blocks[m, 3], everyone.blocks[m, 4]):
+            i = order[k]
+            if mark[i] == HELD_BACK:
+                continue
+            w = noise.fade ** (age - i) if noise.fade < 1.0 else 1.0
+            sums[2] += w * min(lengths2[k], limit * limit)
+            if judge:
+                mark[i] = USED if lengths2[k] <= limit * limit else LEFT_OUT
+            if mark[i] != USED:
+                continue
+            root = math.sqrt(w)
+            for j in range(5):
+                everyone.pixels[j, kept] = everyone.pixels[j, k] * (root if j > 1 else 1.0)
+            for j in range(12):
+                everyone.hands[j, kept] = everyone.hands[j, k]
+            sums[0] += w
+            sums[1] += w * pixels2[k]
+            kept += 1
+        blocks[m, 3], blocks[m, 4] = first, kept
+    used = Spots(everyone.pixels, everyone.hands, blocks)
+    H = information(used, offsets, len(view.M), view.state, 0, 1.0)
+    return transported(H, view.M), sums
+
+
+@jit
+def transported(H, M):
+    """``[J M r]^T [J M r]`` from ``[J r]^T [J r]``; ``M`` is block diagonal."""
+    n = len(M)
+    out = H.copy()
+    if not math.isfinite(H[0, 0]):
+        return out
+    half = np.zeros((n + 1, n + 1))
+    for j in range(n + 1):
+        for k in range(max(0, j - 2), min(n, j + 3)):
+            m = M[k, j] if j < n else 0.0
+            if m != 0.0:
+                for i in range(n + 1):
+                    half[i, j] += H[i, k] * m
+    half[:, n] = H[:, n]
+    out[:] = 0.0
+    for i in range(n + 1):
+        if i == n:
+            out[n] = half[n]
+            break
+        for k in range(max(0, i - 2), min(n, i + 3)):
+            if M[k, i] != 0.0:
+                for j in range(n + 1):
+                    out[i, j] += M[k, i] * half[k, j]
+    return out
+
+
+@jit
+def estimate(H, prior, z, held, tie_from, tie_to, tie_ratio):
+    """Solve the normal equations of spots and prior.
+
+    Returns ``R`` (n+1, n+1) with ``R.T R`` the constrained sum, and the estimate (n,). The corner
+    of ``R`` is the root of the sum of squares that is left there.
+    """
+    n = len(z)
+    total = H + prior
+    constrain(total, held, tie_from, tie_to, tie_ratio)
+    R = cholesky(total)
+    step = np.zeros(n)
+    for i in range(n - 1, -1, -1):
+        v = R[i, n]
+        for j in range(i + 1, n):
+            v -= R[i, j] * step[j]
+        step[i] = v / R[i, i] if R[i, i] > 0.0 else 0.0
+    for t in range(len(tie_from)):
+        step[tie_from[t]] = tie_ratio[t] * step[tie_to[t]]
+    return R, z - step
+
+
+@jit
+def expect(record, path, view, now, R, noise, held, tie_from, tie_to, tie_ratio):
+    """How one new spot compares with the estimate, before it is used.
+
+    Parameters
+    ----------
+    record (14,), path : the spot
+    view : where ``R`` is linearised; now : the state of the estimate itself
+    R, held, ties : as `estimate` has them
+
+    Returns
+    -------
+    residual (2,) px, predicted minus seen; NaN where no spot can be
+    W (3,) : ``w00, w01, w11``, whitening by the spot's own noise (pixel and hand)
+    C (2, 2) : covariance of the whitened residual, ``I`` and the estimate's share
+    J (2, 22) : whitened derivatives by the path's own coordinates, as `kernels.rows`
+    """
+    n = len(view.M)
+    one = np.empty(1, np.int64)
+    one[0] = path
+    spots, _, offsets = gather(record.reshape(1, -1), one, view)
+    state = view.state
+    r = residuals(spots, now)[0]
+    if np.any(noise.hand > 0.0):
+        # with the noise of the hand, but at the commanded pose
+        _, B = _by_hand(spots.hands[:, 0].copy(), spots.blocks[0], now)
+        w00, w01, w11 = spots.pixels[2, 0], spots.pixels[3, 0], spots.pixels[4, 0]
+        s11 = 1.0 / (w11 * w11)
+        s01 = -w01 / (w00 * w11 * w11)
+        s00 = 1.0 / (w00 * w00) + w01 * w01 / (w00 * w00 * w11 * w11)
+        for j in range(6):
+            s00 += B[0, j] * noise.hand[j] * B[0, j]
+            s01 += B[0, j] * noise.hand[j] * B[1, j]
+            s11 += B[1, j] * noise.hand[j] * B[1, j]
+        det = s00 * s11 - s01 * s01
+        if math.isfinite(det) and det > 0.0:
+            w00 = math.sqrt(s11 / det)
+            spots.pixels[2, 0] = w00
+            spots.pixels[3, 0] = -s01 / (det * w00)
+            spots.pixels[4, 0] = 1.0 / math.sqrt(s11)
+    J = rows(spots, state)[0]
+    A = np.zeros((2, n))
+    start = (0, 6, 15, 19)
+    size = (6, 9, 4, 3)
+    for b in range(4):
+        at = offsets[0, b]
+        for i in range(2):
+            for j in range(size[b]):
+                v = 0.0
+                for k in range(max(0, j - 2), min(size[b], j + 3)):
+                    v += J[i, start[b] + k] * view.M[at + k, at + j]
+                A[i, at + j] = v
+    for t in range(len(tie_from)):
+        A[:, tie_to[t]] += tie_ratio[t] * A[:, tie_from[t]]
+    C = np.eye(2)
+    V = np.zeros((2, n))
+    for i in range(2):
+        for j in range(n):
+            if held[j] or R[j, j] <= 0.0:
+                continue
+            v = A[i, j]
+            for k in range(j):
+                v -= R[k, j] * V[i, k]
+            V[i, j] = v / R[j, j]
+    for i in range(2):
+        for j in range(2):
+            for k in range(n):
+                C[i, j] += V[i, k] * V[j, k]
+    return r, spots.pixels[2:, 0].copy(), C, J[:, :22].copy()

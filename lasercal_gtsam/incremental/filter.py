@@ -1,0 +1,497 @@
+"""The running estimate: square-root information about one point, renewed in the background.
+
+Every spot adds two rows, linearised at one point of the cell's chart, to the information; a
+Cholesky decomposition gives estimate and sigmas. Once the estimate has moved away from that point,
+a *pass* goes over the stored spots again, some at each update, and linearises them at the newer
+estimate; when it has caught up, it takes over. So an update costs the same however many spots there
+are, and the estimate is that of the batch problem to some thousandths of a sigma. A pass also
+decides again which spots are outliers, as the batch solution does, and compares the errors: a step
+that made things worse is taken back, and a damped solution takes over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from lasercal_factors import kernels, stream_kernels
+from lasercal_factors.arrays import State
+from lasercal_factors.chart import BEAM_DIM, CAMERA_DIM, PLANE_DIM, CellChart
+from lasercal_factors.stream_kernels import Weighing, View
+
+from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.graph import cell_from_state, state_from_cell
+from lasercal_gtsam.incremental.belief import (
+    POSE,
+    Belief,
+    carried,
+    cell_tangent_map,
+    expansion,
+)
+from lasercal_gtsam.incremental.store import SpotStore
+from lasercal_gtsam.robust import rejection_length
+
+Mask = npt.NDArray[np.bool_]
+Marks = npt.NDArray[np.uint8]
+Index = npt.NDArray[np.int64]
+Prior = Callable[[Array], Array]
+
+# spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
+SLICE, SLICE_HAND = 1000, 250
+# joint distance in sigmas from the point of linearisation at which a pass begins
+_MOVED = 0.05
+# where a pass is done within the update: distance at which the estimate has settled
+_SETTLED, _ROUNDS = 0.01, 8
+# a pass begins also when this many more spots are there than at the last (outliers are judged anew)
+_GROWN = 1.25
+# an accepted step may raise the error by this many squared sigmas (rounding, marks)
+_WORSE = 1.0
+_LEVENBERG = 12
+# weight below which a fading spot is forgotten, and the least residual scale (exact data)
+_FADED, _MIN_SCALE = 1e-9, 1e-7
+
+
+@dataclass
+class _Linear:
+    """Spots linearised at a point of the chart.
+
+    ``H`` (n+1, n+1): their information; ``soft``: that of the priors which are not quadratic;
+    ``sums``: weight, squared pixels and loss, as `stream_kernels.accumulate` gives them.
+    """
+
+    z: Array
+    view: View
+    H: Array
+    soft: Array
+    sums: Array
+
+
+@dataclass
+class _Pass:
+    """A linearisation on its way, done up to spot ``at``; ``marks`` wait until it takes over."""
+
+    linear: _Linear
+    at: int
+    marks: list[tuple[int, Marks]] = field(default_factory=list)
+
+
+class Expected(NamedTuple):
+    """How a spot compares with the estimate; see `stream_kernels.expect`."""
+
+    residual: Array
+    W: Array
+    C: Array
+    J: Array
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the filter knows, to be read later whatever comes then.
+
+    Attributes
+    ----------
+    chart, template : coordinates, and the names of the parts
+    held : (n,) constants
+    open : (n,) coordinates that are not determined yet
+    z : (n,) the estimate
+    R : (n+1, n+1) square root of the information
+    cost, dof : sum of squares (a-priori sigmas) and degrees of freedom
+    weight, square : number of the used spots, and their squared residuals (px^2)
+    """
+
+    chart: CellChart
+    template: Cell
+    held: Mask
+    open: Mask
+    z: Array
+    R: Array
+    cost: float
+    dof: float
+    weight: float
+    square: float
+
+    @property
+    def sigma0(self) -> float:
+        """A-posteriori scale of the a-priori pixel sigmas; NaN without degrees of freedom."""
+        return float(np.sqrt(self.cost / self.dof)) if self.dof >= 1 else float("nan")
+
+    @property
+    def rms_px(self) -> float:
+        """Residual RMS of the used spots, px."""
+        return float(np.sqrt(self.square / self.weight)) if self.weight > 0 else 0.0
+
+    @property
+    def state(self) -> State:
+        """Plain arrays of the estimate."""
+        return self.chart.state(self.z)
+
+    @property
+    def cell(self) -> Cell:
+        """The estimate."""
+        return cell_from_state(self.state, self.template)
+
+    def belief(self, scale: float | None = None) -> Belief:
+        """The estimate as a `Belief`; in units of ``scale`` (``sigma0``; 1 where there is none)."""
+        n, state = len(self.z), self.state
+        H = self.R[:n, :n].T @ self.R[:n, :n]
+        out = self.held | self.open
+        H[out], H[:, out] = 0.0, 0.0
+        scale = self.sigma0 if scale is None else scale
+        scale = scale if np.isfinite(scale) and scale > 0 else 1.0
+        information = carried(H, self.chart, self.z, state) / scale**2
+        return Belief(
+            cell_from_state(state, self.template), information, self._fixed(), self._aspect
+        )
+
+    def covariance(self) -> Array:
+        """(n, n) in the tangent coordinates of `cell`, scaled by ``sigma0``.
+
+        Zero for constants, NaN for what is not determined yet and where there is no scale.
+        """
+        fixed = self._fixed() | self.open
+        free = np.flatnonzero(~fixed)
+        root = np.linalg.inv(self.R[np.ix_(free, free)])
+        E = expansion(self.template, fixed, self._aspect)
+        J = cell_tangent_map(self.chart, self.z, self.state) @ E @ root
+        covariance = np.asarray(self.sigma0**2 * J @ J.T)
+        constant = ~np.any(E != 0, axis=1) & ~self.open
+        covariance[constant], covariance[:, constant] = 0.0, 0.0
+        covariance[self.open], covariance[:, self.open] = np.nan, np.nan
+        return covariance
+
+    @property
+    def _aspect(self) -> dict[str, float]:
+        pairs = zip(self.template.cameras, self.chart.aspects, strict=True)
+        return {name: aspect for name, aspect in pairs if aspect is not None}
+
+    def _fixed(self) -> Mask:
+        """Constants, and the focal lengths that follow others."""
+        fixed = self.held.copy()
+        fixed[15 * np.flatnonzero(~np.isnan(self.chart.aspect_array)) + 6] = True
+        return fixed
+
+
+class Filter:
+    """Square-root information filter over a `SpotStore`.
+
+    Parameters
+    ----------
+    store : the spots; those marked `USED` count
+    cell : reference of the chart, all parts known
+    held : (n,) constants
+    aspects : tied ``fu / fv`` for each camera, or None
+    prior : (n+1, n+1) quadratic about the chart's origin, in a-priori sigmas: older spots, or a
+        calibration; ``prior_rows``: how many residuals are behind its corner
+    soft : priors that are not quadratic: coordinates to their augmented information, as ``prior``
+    noise : of the hand, and fading
+    start : where to begin (n,); the reference if left out
+    scale : a-posteriori scale to begin with
+    """
+
+    def __init__(
+        self,
+        store: SpotStore,
+        cell: Cell,
+        held: Mask,
+        aspects: tuple[float | None, ...],
+        *,
+        prior: Array | None = None,
+        prior_rows: float = 0.0,
+        soft: Prior | None = None,
+        noise: Weighing | None = None,
+        start: Array | None = None,
+        scale: float = 1.0,
+    ) -> None:
+        self.store, self.template = store, cell
+        self.chart = CellChart(state_from_cell(cell), aspects)
+        n = self.chart.n
+        self.held = held.copy()
+        self.open = np.zeros(n, np.bool_)
+        self.noise = noise or Weighing(np.zeros(6), 1.0)
+        self.prior = np.zeros((n + 1, n + 1)) if prior is None else prior
+        self.prior_rows = prior_rows
+        self._soft = soft
+        tied = np.flatnonzero(~np.isnan(self.chart.aspect_array))
+        self._ties = (15 * tied + 6, 15 * tied + 7, self.chart.aspect_array[tied])
+        self._slice = SLICE_HAND if np.any(self.noise.hand > 0) else SLICE
+        self._paths, self._offsets = np.empty((0, 3), np.int64), np.empty((0, 4), np.int64)
+        self._pass: _Pass | None = None
+        self._judged = 0
+        self.scale = scale
+        self.fallbacks = 0
+        self._linear = self._at(np.zeros(n) if start is None else start)
+        self._unknowns = self._count_unknowns()
+        self._solve()
+
+    # --- what is known --------------------------------------------------------------------------
+
+    @property
+    def estimate(self) -> Estimate:
+        """The state of things, to be kept."""
+        cost = float(self._R[-1, -1] ** 2)
+        there = self._cost_there()
+        weight, square, _ = self._linear.sums
+        square *= cost / there if there > 0 else 1.0
+        return Estimate(
+            self.chart, self.template, self.held, self.open, self.z, self._R,
+            cost, self.dof, float(weight), float(square),
+        )  # fmt: skip
+
+    @property
+    def dof(self) -> float:
+        """Residuals minus the unknowns that they determine."""
+        return 2.0 * float(self._linear.sums[0]) + self.prior_rows - self._unknowns
+
+    @property
+    def limit(self) -> float:
+        """Whitened residual length (a-priori sigmas) beyond which a spot is an outlier."""
+        return rejection_length(len(self.store)) * self.scale
+
+    @property
+    def moved(self) -> float:
+        """Distance (joint sigmas) of the estimate from its point of linearisation."""
+        return float(np.linalg.norm(self._R[:-1, -1])) / self.scale
+
+    def expect(self, number: int) -> Expected:
+        """How a stored spot compares with the estimate."""
+        self._learn_paths()
+        _, (record, path, _) = next(iter(self.store.slices(number, number + 1)))
+        return Expected(
+            *stream_kernels.expect(
+                record[0], path[0], self._linear.view, self.now, self._R, self.noise,
+                *self._constraints,
+            )
+        )  # fmt: skip
+
+    # --- spots ----------------------------------------------------------------------------------
+
+    def use(self, begin: int, end: int) -> None:
+        """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew."""
+        self._learn_paths()
+        if self.noise.fade < 1.0:
+            self._fade(self.noise.fade ** (end - begin))
+        self._add(self._linear, begin, end)
+        self._solve()
+
+    def settle(self) -> None:
+        """Relinearise: at once where there are few spots, else a bounded share of it."""
+        if len(self.store) <= self._slice:
+            self.relinearise(_SETTLED)
+            return
+        if self._pass is None and (self.moved > _MOVED or self._grown()):
+            self._pass = self._new_pass()
+        if self._pass is not None:
+            self._advance(self._pass)
+            if self._pass.at >= self.store.end:
+                self._take_over(self._pass)
+
+    def relinearise(self, settled: float = 0.0) -> None:
+        """Gauss-Newton over all spots until the estimate has settled (sigmas); cost linear."""
+        self._pass = None
+        for k in range(_ROUNDS):
+            if (k or settled) and self.moved <= (settled or _SETTLED) and not self._grown():
+                return
+            self._pass = self._new_pass()
+            while self._pass.at < self.store.end:
+                self._advance(self._pass)
+            if not self._take_over(self._pass):
+                return
+
+    def take_out(self, begin: int, end: int, mark: int) -> None:
+        """Take the spots begin ... end-1 out of the estimate and mark them."""
+        self._learn_paths()
+        part = replace(
+            self._linear, H=np.zeros_like(self._linear.H), sums=np.zeros_like(self._linear.sums)
+        )
+        self._add(part, begin, end)
+        self._linear.H = self._linear.H - part.H
+        self._linear.sums = self._linear.sums - part.sums
+        self.store.mark(begin, end, mark)
+        self._pass = None
+        self._solve()
+
+    def fold(self, end: int) -> None:
+        """Turn the spots before ``end`` into prior knowledge and let them go."""
+        part = replace(
+            self._linear, H=np.zeros_like(self._linear.H), sums=np.zeros_like(self._linear.sums)
+        )
+        self._add(part, self.store.first, end)
+        self._linear.H = self._linear.H - part.H
+        self._linear.sums = self._linear.sums - part.sums
+        self.prior = self.prior + about_origin(part.H, self._linear.z)
+        self.prior_rows += 2.0 * float(part.sums[0])
+        self.store.forget(end)
+        self._pass = None
+        self._solve()
+
+    # --- inside ---------------------------------------------------------------------------------
+
+    @property
+    def _constraints(self) -> tuple[Mask, Index, Index, Array]:
+        held = self.held | self.open
+        held[self._ties[0]] = True
+        return (held, *self._ties)
+
+    def _learn_paths(self) -> None:
+        """Keep the tables of paths up to date with the store; the parts are in the chart."""
+        if len(self._paths) == len(self.store.paths):
+            return
+        cell = self.template
+        cameras, lasers, planes = list(cell.cameras), list(cell.lasers), list(cell.planes)
+        first_laser = CAMERA_DIM * len(cameras)
+        first_plane = first_laser + BEAM_DIM * len(lasers)
+        index, offsets = [], []
+        for camera, laser, plane, _ in self.store.paths:
+            # a path to a part that is not known yet belongs to spots that are held back
+            c, l, p = (  # noqa: E741
+                names.index(name) if name in names else 0
+                for names, name in ((cameras, camera), (lasers, laser), (planes, plane))
+            )
+            index.append((c, l, p))
+            pose, laser_at = CAMERA_DIM * c, first_laser + BEAM_DIM * l
+            offsets.append((pose, pose + POSE, laser_at, first_plane + PLANE_DIM * p))
+        self._paths, self._offsets = np.array(index, np.int64), np.array(offsets, np.int64)
+        running = [self._pass.linear] if self._pass else []
+        for linear in [self._linear, *running]:
+            linear.view = linear.view._replace(paths=self._paths, offsets=self._offsets)
+
+    def _at(self, z: Array) -> _Linear:
+        """No spots yet, linearised at ``z``."""
+        size = self.chart.n + 1
+        about = (self.chart.aspect_array, self.chart.reference)
+        view: View = stream_kernels.view_at(z, *about, self._paths, self._offsets)
+        soft = np.zeros((size, size))
+        if self._soft is not None:
+            soft = self.scale**2 * self._soft(z)
+        return _Linear(z, view, np.zeros((size, size)), soft, np.zeros(3))
+
+    def _grown(self) -> bool:
+        return len(self.store) > _GROWN * self._judged
+
+    def _new_pass(self) -> _Pass:
+        self._judged = len(self.store)
+        return _Pass(self._at(self.z), self.store.first)
+
+    def _fade(self, factor: float) -> None:
+        self.prior = factor * self.prior
+        self.prior_rows *= factor
+        running = [self._pass.linear] if self._pass else []
+        for linear in [self._linear, *running]:
+            linear.H = factor * linear.H
+            linear.sums = factor * linear.sums
+        horizon = int(np.log(_FADED) / np.log(self.noise.fade))
+        if self._pass is None and len(self.store) > 2 * horizon:
+            self.store.forget(self.store.end - horizon)
+
+    def _add(
+        self, linear: _Linear, begin: int, end: int, judge: bool = False
+    ) -> list[tuple[int, Marks]]:
+        """Add spots to a linearisation; where they are judged anew, their marks, not yet set."""
+        found = []
+        for first, (records, path, mark) in self.store.slices(begin, end):
+            marks = mark.copy() if judge else mark
+            age = self.store.end - 1 - first
+            H, sums = stream_kernels.accumulate(
+                records, path, marks, linear.view, self.noise, self.limit, judge, age
+            )
+            linear.H = linear.H + H
+            linear.sums = linear.sums + sums
+            found.append((first, marks))
+        return found
+
+    def _advance(self, running: _Pass) -> None:
+        end = min(running.at + self._slice, self.store.end)
+        running.marks += self._add(running.linear, running.at, end, judge=True)
+        running.at = end
+
+    def _take_over(self, running: _Pass) -> bool:
+        """Make the pass the linearisation; False where it was worse and damping took over."""
+        self._pass = None
+        before, after = self._loss(self._linear), self._loss(running.linear)
+        if not after <= before + _WORSE * self.scale**2 + 1e-3 * before:
+            self._damped(before)
+            return False
+        self._accept(running)
+        return True
+
+    def _accept(self, done: _Pass) -> None:
+        for first, marks in done.marks:
+            self.store.mark_each(first, marks)
+        self._linear = done.linear
+        self._unknowns = self._count_unknowns()
+        self._solve()
+
+    def _damped(self, loss: float) -> None:
+        """Levenberg's way down from the point of linearisation, over all spots (cost linear)."""
+        self.fallbacks += 1
+        n = self.chart.n
+        damping = 1e-3
+        for _ in range(_LEVENBERG):
+            linear = self._linear
+            extra = np.zeros_like(linear.H)
+            extra[range(n), range(n)] = damping * np.diag(linear.H)[:n]
+            prior = about_point(self.prior, linear.z) + linear.soft + extra
+            _, z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
+            trial = _Pass(self._at(z), self.store.first)
+            while trial.at < self.store.end:
+                self._advance(trial)
+            found = self._loss(trial.linear)
+            if found < loss:
+                loss, damping = found, damping / 10.0
+                self._accept(trial)
+                if self.moved <= _SETTLED:
+                    return
+            else:
+                damping *= 10.0
+
+    def _loss(self, linear: _Linear) -> float:
+        if not np.isfinite(linear.H[0, 0]):
+            return float("inf")
+        prior = about_point(self.prior, linear.z)[-1, -1] + linear.soft[-1, -1]
+        return float(linear.sums[2] + prior)
+
+    def _cost_there(self) -> float:
+        prior = about_point(self.prior, self._linear.z)[-1, -1] + self._linear.soft[-1, -1]
+        return float(self._linear.H[-1, -1] + prior)
+
+    def _solve(self) -> None:
+        linear = self._linear
+        prior = about_point(self.prior, linear.z) + linear.soft
+        self._R, self.z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
+        self.now: State = self.chart.state(self.z)
+        if self.dof >= 1:
+            self.scale = max(float(self._R[-1, -1]) / float(np.sqrt(self.dof)), _MIN_SCALE)
+
+    def _count_unknowns(self) -> float:
+        """Unknowns that spots (not soft priors) determine."""
+        held = self._constraints[0]
+        free = np.flatnonzero(~held)
+        if self._soft is None:
+            return float(len(free))
+        linear = self._linear
+        data = linear.H + about_point(self.prior, linear.z)
+        total = data + linear.soft
+        for H in (data, total):
+            kernels.constrain(H, *self._constraints)
+        where = np.ix_(free, free)
+        return float(np.trace(np.linalg.lstsq(total[where], data[where], rcond=None)[0]))
+
+
+def about_point(quadratic: Array, z: Array) -> Array:
+    """The augmented information of ``|J x + r|^2`` about ``x = z`` instead of the origin."""
+    n = len(z)
+    out = quadratic.copy()
+    A, b = quadratic[:n, :n], quadratic[:n, n]
+    Az = A @ z
+    out[:n, n] = out[n, :n] = b + Az
+    out[n, n] = quadratic[n, n] + z @ (2.0 * b + Az)
+    return out
+
+
+def about_origin(quadratic: Array, z: Array) -> Array:
+    """The inverse of `about_point`."""
+    return about_point(quadratic, -z)

@@ -1,0 +1,176 @@
+"""The spots of a running calibration: 112 bytes each, and which of them the estimate uses.
+
+Segments of constant size are allocated as they are needed and never copied, so that a new spot
+costs the same whatever came before. Old segments can be let go.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+from lasercal_factors.batch import whitening_from_covariance
+from lasercal_factors.stream_kernels import HELD_BACK, LEFT_OUT, RECORD, USED
+
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.observations import Observations
+
+SEGMENT = 1 << 15
+# camera, laser, plane, and whether the pixel covariance was stated (else it is an assumed one)
+Path = tuple[str, str, str, bool]
+Slice = tuple[Array, npt.NDArray[np.int32], npt.NDArray[np.uint8]]
+
+__all__ = ["HELD_BACK", "LEFT_OUT", "SEGMENT", "USED", "Path", "SpotStore"]
+
+
+class SpotStore:
+    """Spots by number, from `first` to `end`; numbers never change, old ones go away."""
+
+    def __init__(self, image_size: dict[str, tuple[int, int]]) -> None:
+        self.image_size = dict(image_size)
+        self.paths: list[Path] = []
+        self.first = 0
+        self.end = 0
+        self._numbers: dict[Path, int] = {}
+        self._segments: dict[int, tuple[Array, npt.NDArray[np.int32], npt.NDArray[np.uint8]]] = {}
+        self._labels: dict[int, list[str]] = {}
+
+    def __len__(self) -> int:
+        return self.end - self.first
+
+    def append(self, observations: Observations, cov_uv: Array, mark: int = HELD_BACK) -> range:
+        """Store spots, with the pixel covariances (N, 2, 2) they count with; their numbers."""
+        records = records_of(observations, cov_uv)
+        self.image_size.update(observations.image_size)
+        numbers = [
+            self._path(path)
+            for path in zip(
+                observations.camera.tolist(),
+                observations.laser.tolist(),
+                observations.plane.tolist(),
+                (~np.isnan(observations.cov_uv[:, 0, 0])).tolist(),
+                strict=True,
+            )
+        ]
+        start, labels = self.end, observations.id.tolist()
+        done = 0
+        while done < len(records):
+            at = self.end % SEGMENT
+            space, path, marks = self._segment(self.end // SEGMENT)
+            count = min(len(records) - done, SEGMENT - at)
+            space[at : at + count] = records[done : done + count]
+            path[at : at + count] = numbers[done : done + count]
+            marks[at : at + count] = mark
+            self._labels[self.end // SEGMENT] += labels[done : done + count]
+            self.end += count
+            done += count
+        return range(start, self.end)
+
+    def slices(self, begin: int, end: int) -> Iterator[tuple[int, Slice]]:
+        """Views of the spots begin ... end-1, piece by piece: first number, then the arrays."""
+        while begin < end:
+            number, at = divmod(begin, SEGMENT)
+            stop = min(SEGMENT, at + end - begin)
+            space, path, marks = self._segments[number]
+            yield begin, (space[at:stop], path[at:stop], marks[at:stop])
+            begin += stop - at
+
+    def mark(self, begin: int, end: int, mark: int) -> None:
+        """Set what the estimate does with these spots."""
+        for _, (_, _, marks) in self.slices(begin, end):
+            marks[:] = mark
+
+    def mark_each(self, begin: int, marks: npt.NDArray[np.uint8]) -> None:
+        """Set what the estimate does with each spot from ``begin`` on."""
+        for first, (_, _, stored) in self.slices(begin, begin + len(marks)):
+            stored[:] = marks[first - begin : first - begin + len(stored)]
+
+    def marks(self, begin: int | None = None, end: int | None = None) -> npt.NDArray[np.uint8]:
+        """Marks of the spots begin ... end-1 (all that are stored, if left out)."""
+        parts = [s[2] for _, s in self.slices(self._from(begin), self._to(end))]
+        return np.concatenate(parts) if parts else np.empty(0, np.uint8)
+
+    def label(self, number: int) -> str:
+        """Label of a spot."""
+        return self._labels[number // SEGMENT][number % SEGMENT]
+
+    def path_of(self, number: int) -> Path:
+        """Which way a spot went."""
+        return self.paths[int(self._segments[number // SEGMENT][1][number % SEGMENT])]
+
+    def observations(self, begin: int | None = None, end: int | None = None) -> Observations:
+        """The spots begin ... end-1 (all that are stored, if left out) as they were given."""
+        begin, end = self._from(begin), self._to(end)
+        pieces = [s for _, s in self.slices(begin, end)]
+        records = np.concatenate([p[0] for p in pieces]) if pieces else np.empty((0, RECORD))
+        index = np.concatenate([p[1] for p in pieces]) if pieces else np.empty(0, np.int32)
+        names = np.array([path[:3] for path in self.paths], dtype=np.str_).reshape(-1, 3)[index]
+        stated = np.array([path[3] for path in self.paths], dtype=np.bool_)[index]
+        uv, cov_uv, T = split_records(records)
+        cov_uv[~stated] = np.nan
+        return Observations(
+            uv=uv,
+            cov_uv=cov_uv,
+            T_base_hand=T,
+            camera=names[:, 0],
+            laser=names[:, 1],
+            plane=names[:, 2],
+            id=np.array([self.label(k) for k in range(begin, end)], dtype=np.str_),
+            image_size=self.image_size,
+        )
+
+    def forget(self, end: int) -> None:
+        """Let the spots before ``end`` go."""
+        self.first = max(self.first, end)
+        for number in [n for n in self._segments if (n + 1) * SEGMENT <= self.first]:
+            del self._segments[number], self._labels[number]
+
+    def _from(self, begin: int | None) -> int:
+        return self.first if begin is None else begin
+
+    def _to(self, end: int | None) -> int:
+        return self.end if end is None else end
+
+    def _path(self, path: Path) -> int:
+        number = self._numbers.get(path)
+        if number is None:
+            number = self._numbers[path] = len(self.paths)
+            self.paths.append(path)
+        return number
+
+    def _segment(self, number: int) -> Slice:
+        if number not in self._segments:
+            # pages are touched, and memory is used, only as spots arrive
+            self._segments[number] = (
+                np.empty((SEGMENT, RECORD)),
+                np.empty(SEGMENT, np.int32),
+                np.empty(SEGMENT, np.uint8),
+            )
+            self._labels[number] = []
+        return self._segments[number]
+
+
+def records_of(observations: Observations, cov_uv: Array) -> Array:
+    """Rows of `lasercal_factors.stream_kernels`, (N, 14)."""
+    T = observations.T_base_hand
+    return np.column_stack(
+        [
+            observations.uv,
+            whitening_from_covariance(cov_uv),
+            T[:, :3, 0],
+            T[:, :3, 1],
+            T[:, :3, 3],
+        ]
+    )
+
+
+def split_records(records: Array) -> tuple[Array, Array, Array]:
+    """Pixels (N, 2), covariances (N, 2, 2) and hand poses (N, 4, 4) of rows of the store."""
+    w00, w01, w11 = records[:, 2:5].T
+    W = np.zeros((len(records), 2, 2))
+    W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = 1 / w00, -w01 / (w00 * w11), 1 / w11
+    T = np.tile(np.eye(4), (len(records), 1, 1))
+    T[:, :3, 0], T[:, :3, 1], T[:, :3, 3] = records[:, 5:8], records[:, 8:11], records[:, 11:14]
+    T[:, :3, 2] = np.cross(records[:, 5:8], records[:, 8:11])
+    return records[:, :2], W @ np.swapaxes(W, 1, 2), T
