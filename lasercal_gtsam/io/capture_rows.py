@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -86,7 +86,7 @@ def rows_of(head: CaptureHead, poses: Table, spots: Table | None) -> Rows:
     lasers = poses.text("laser") if "laser" in poses.columns else [DEFAULT_LASER] * count
     T_base_hand = _poses(poses, head, warnings)
     sizes = {camera.name: (camera.width, camera.height) for camera in head.camera}
-    uv, cov = _spots(poses, [sizes.get(name) for name in cameras])
+    uv, cov = spot_pixels(poses, [sizes.get(name) for name in cameras])
     verdict = [USED if given else "" for given in _complete(uv)]
     reason = [""] * count
     if spots is not None:
@@ -202,8 +202,11 @@ def _rotation_warnings(fmt: str, values: Array, R: Array, name: str) -> list[str
 # --- spots --------------------------------------------------------------------------------------
 
 
-def _spots(table: Table, sizes: list[tuple[int, int] | None]) -> tuple[Array, Array]:
-    """Pixels (N, 2) and covariances (N, 2, 2) of a table; NaN where cells are empty."""
+def spot_pixels(table: Table, sizes: Sequence[tuple[int, int] | None]) -> tuple[Array, Array]:
+    """Pixels (N, 2) and covariances (N, 2, 2) of a table; NaN where cells are empty.
+
+    ``sizes`` of the rows' pictures, where known; pixels must lie inside.
+    """
     count = len(table)
     uv, cov = np.full((count, 2), np.nan), np.full((count, 2, 2), np.nan)
     if not {"u", "v"} & set(table.columns):
@@ -281,7 +284,7 @@ def _merge_spots(
     uv_rows, cov_rows, verdict_rows, reason_rows = into
     row_of = {name: row for row, name in enumerate(ids)}
     found = table.unique("id")
-    uv, cov = _spots(table, [size_of.get(name) for name in found])
+    uv, cov = spot_pixels(table, [size_of.get(name) for name in found])
     verdicts = table.columns.get("verdict", [""] * len(table))
     reasons = table.columns.get("reason", [""] * len(table))
     for row, name in enumerate(found):

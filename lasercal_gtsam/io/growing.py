@@ -7,7 +7,6 @@ cut or changed before its end is read again from the start.
 from __future__ import annotations
 
 import csv
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -27,10 +26,12 @@ class Grown:
     ----------
     rows : line number and cells of whole lines that are new (or read again)
     problems : line number and what is wrong, for lines that are no text or no CSV; line 0: the file
+    again : the file was read from its start, as at the first time
     """
 
     rows: tuple[Row, ...] = ()
     problems: tuple[tuple[int, str], ...] = ()
+    again: bool = False
 
 
 class GrowingTable:
@@ -65,7 +66,7 @@ class GrowingTable:
             if seen == self._seen:
                 self.quiet += 1
                 return Grown()
-            content = self._new_bytes(seen)
+            content, again = self._new_bytes(seen)
         except FileNotFoundError:
             # some programs remove a file before they write it anew: what is known stays known
             self.exists, self._seen = False, None
@@ -74,27 +75,31 @@ class GrowingTable:
             self._seen = None
             return Grown(problems=((0, reason_of(error)),))
         self._seen, self.quiet = seen, 0
-        return self._take(content)
+        return self._take(content, again)
+
+    def read_again(self) -> None:
+        """Let the next look begin at the file's start."""
+        self._seen = None
 
     def _start_over(self) -> None:
         self.header = None
         self._offset = self._line = 0
         self._overlap = b""
 
-    def _new_bytes(self, seen: tuple[int, ...]) -> bytes:
-        """Everything behind the last whole line, or the whole file where it is not the same one."""
+    def _new_bytes(self, seen: tuple[int, ...]) -> tuple[bytes, bool]:
+        """Everything behind the last whole line; or the whole file, where it is another one."""
         before = self._seen
         grown = before is not None and seen[:2] == before[:2] and seen[2] > before[2]
         with self.path.open("rb") as file:
             if grown:
                 file.seek(self._offset - len(self._overlap))
                 if file.read(len(self._overlap)) == self._overlap:
-                    return file.read()
+                    return file.read(), False
             self._start_over()
-            file.seek(0, os.SEEK_SET)
-            return file.read()
+            file.seek(0)
+            return file.read(), True
 
-    def _take(self, content: bytes) -> Grown:
+    def _take(self, content: bytes, again: bool) -> Grown:
         end = content.rfind(b"\n") + 1
         whole = content[:end]
         rows: list[Row] = []
@@ -115,7 +120,7 @@ class GrowingTable:
         self._offset += end
         self._overlap = (self._overlap + whole)[-_OVERLAP:]
         self.unfinished = self._line + 1 if content[end:].strip() else 0
-        return Grown(tuple(rows), tuple(problems))
+        return Grown(tuple(rows), tuple(problems), again)
 
 
 def _cells(line: bytes) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -36,42 +37,54 @@ class KnownSpots:
 
     def add(self, observations: Observations, where: str) -> None:
         """Remember spots; ``where`` says for messages where they are ("calibration.json")."""
-        for name, pose, pixel in _digests(observations):
+        poses, pixels = _poses(observations), _pixels(observations.uv, observations.cov_uv)
+        for name, pose, pixel in zip(observations.id.tolist(), poses, pixels, strict=True):
             self._spots.setdefault(name, []).append(_Known(pose, pixel, where))
 
     def where(self, name: str) -> str:
         """Where a spot of that id is."""
         return self._spots[name][0].where
 
-    def same(self, observations: Observations, pixels: bool = True) -> list[bool]:
-        """Whether each spot, whose id is known, is one of those known by it.
-
-        Poses and names are compared, and with ``pixels`` the pixels and their covariances.
-        """
+    def same_poses(self, observations: Observations) -> list[bool]:
+        """Whether each spot has pose, camera, laser and plane of the one known by its id."""
+        poses = _poses(observations)
         return [
-            any(
-                known.pose == pose and (known.pixel == pixel or not pixels)
-                for known in self._spots[name]
-            )
-            for name, pose, pixel in _digests(observations)
+            any(known.pose == pose for known in self._spots[name])
+            for name, pose in zip(observations.id.tolist(), poses, strict=True)
+        ]
+
+    def same_pixels(self, names: Sequence[str], uv: Array, cov_uv: Array) -> list[bool]:
+        """Whether each spot has pixel and covariance of the one known by its id."""
+        pixels = _pixels(uv, cov_uv)
+        return [
+            any(known.pixel == pixel for known in self._spots[name])
+            for name, pixel in zip(names, pixels, strict=True)
+        ]
+
+    def same(self, observations: Observations) -> list[bool]:
+        """Whether each spot is the one known by its id, in all that is measured."""
+        poses, pixels = _poses(observations), _pixels(observations.uv, observations.cov_uv)
+        return [
+            any(known.pose == pose and known.pixel == pixel for known in self._spots[name])
+            for name, pose, pixel in zip(observations.id.tolist(), poses, pixels, strict=True)
         ]
 
 
-def _digests(observations: Observations) -> list[tuple[str, bytes, bytes]]:
+def _poses(observations: Observations) -> list[bytes]:
     # adding 0.0 makes -0.0 and 0.0 the same bytes
-    poses = np.round(observations.T_base_hand[:, :3], _DECIMALS_POSE) + 0.0
-    pixels = np.round(observations.uv, _DECIMALS_PX) + 0.0
-    return [
-        (
-            str(observations.id[k]),
-            _digest(
-                f"{observations.camera[k]}\0{observations.laser[k]}\0{observations.plane[k]}",
-                poses[k].tobytes(),
-            ),
-            _digest(_sigmas(observations.cov_uv[k]), pixels[k].tobytes()),
-        )
-        for k in range(len(observations))
-    ]
+    numbers = np.round(observations.T_base_hand[:, :3], _DECIMALS_POSE) + 0.0
+    names = zip(
+        observations.camera.tolist(),
+        observations.laser.tolist(),
+        observations.plane.tolist(),
+        strict=True,
+    )
+    return [_digest("\0".join(who), T.tobytes()) for who, T in zip(names, numbers, strict=True)]
+
+
+def _pixels(uv: Array, cov_uv: Array) -> list[bytes]:
+    numbers = np.round(uv, _DECIMALS_PX) + 0.0
+    return [_digest(_sigmas(cov), p.tobytes()) for p, cov in zip(numbers, cov_uv, strict=True)]
 
 
 def _sigmas(cov: Array) -> str:
