@@ -220,7 +220,8 @@ class Scan:
             after = f", with {whole} whole records after it" if whole else ""
             raise DataError(
                 f"{where}{after}: no interrupted write leaves this, so nothing is cut off. Put "
-                "back a copy of the file, or see with lasercal_gtsam.io.journal.salvage what is left"
+                "back a copy of the file, or see what is left with "
+                "lasercal_gtsam.io.journal.salvage"
             )
         more = f", then {whole} whole records of the same unfinished write" if whole else ""
         self.tail = where + more
