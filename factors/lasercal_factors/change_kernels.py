@@ -1,0 +1,310 @@
+"""Compiled loops that watch a stream of innovations for a change.
+
+The statistic is that of Shiryaev (1963) and Roberts (1966), ``R_n = sum_k L_k^n`` over all onsets
+``k <= n``, ``L_k^n`` the likelihood ratio of spots k..n under "changed at k" against "unchanged".
+Every onset starts with weight one and is multiplied, spot by spot, by ``q(e) / p(e)``: its own
+predictive density over that of an unchanged cell. Hence ``R_n - n`` is a martingale while nothing
+changes, and the mean number of spots to a false alarm at ``R >= A`` is at least
+``A`` (Pollak 1985).
+That holds for any predictive density ``q`` chosen before the spot is seen: for mixtures of causes,
+for a change that is itself estimated on the way, and when two onsets are merged.
+
+Densities as in `change_densities`; arrays as in `change_arrays`. Arrays keep the onsets along the
+last axis, so that loops run several at a time.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from lasercal_factors.change_arrays import LAG, SLOTS, WINDOW
+from lasercal_factors.change_densities import expected_density, gate_length, outlier_density
+from lasercal_factors.kernels import jit
+
+_SINGLE = 15  # onsets up to this age are never merged
+_RUN_RATE = 0.9  # rate of outliers of a part that was bumped beyond all prediction
+_PRIOR_OUTLIERS, _PRIOR_SPOTS = 0.5, 500.0  # Beta prior of the rate of outliers
+_PART_SPOTS = 300.0  # weight, in spots, with which a part's own rate leans on the overall one
+_MEMORY = 10_000.0  # spots over which rates are remembered
+_MIDDLE = 500.0  # spots over which the middle of a plane's spots is remembered
+
+
+@jit
+def overall_rate(outliers):
+    """Mean of the Beta posterior of the rate of outliers, from ``outliers`` (2,)."""
+    return (_PRIOR_OUTLIERS + outliers[0]) / (_PRIOR_SPOTS + outliers[1])
+
+
+@jit
+def outlier_rate(watch, camera, laser, plane):
+    """Running rate of outliers: the largest of the overall one and those of the three parts.
+
+    Rates of parts are shrunk to the overall one. The largest, because a
+    rate too low makes alarms and a rate too high only delays them.
+    """
+    overall = overall_rate(watch.outliers)
+    rate = overall
+    for k in range(3):
+        if k == 0:
+            counts = watch.cameras.outliers[camera]
+        elif k == 1:
+            counts = watch.lasers.outliers[laser]
+        else:
+            counts = watch.planes.outliers[plane]
+        rate = max(rate, (_PART_SPOTS * overall + counts[0]) / (_PART_SPOTS + counts[1]))
+    return min(rate, 0.5)
+
+
+@jit
+def _count_outlier(counts, probability):
+    """Count a spot, fading the past beyond `_MEMORY` spots."""
+    counts[0] += probability
+    counts[1] += 1.0
+    if counts[1] > _MEMORY:
+        counts[0] *= _MEMORY / counts[1]
+        counts[1] = _MEMORY
+
+
+@jit
+def _count(watch, number):
+    """Count spot ``number`` overall, and the one `LAG` spots before it for its parts."""
+    _count_outlier(watch.outliers, watch.recent[number % len(watch.recent), 0])
+    if number >= LAG:
+        row = watch.recent[(number - LAG) % len(watch.recent)]
+        _count_outlier(watch.cameras.outliers[int(row[1])], row[0])
+        _count_outlier(watch.lasers.outliers[int(row[2])], row[0])
+        _count_outlier(watch.planes.outliers[int(row[3])], row[0])
+
+
+@jit
+def _log_add(a, b):
+    """``log(exp(a) + exp(b))``."""
+    if a < b:
+        a, b = b, a
+    return a if b == -np.inf else a + math.log1p(math.exp(b - a))
+
+
+@jit
+def _remove(bank, p, m, slot):
+    """Forget one onset; younger ones move up."""
+    last = bank.used[p, m] - 1
+    for k in range(slot, last):
+        bank.log_weight[p, m, k] = bank.log_weight[p, m, k + 1]
+        bank.first[p, m, k] = bank.first[p, m, k + 1]
+        bank.age[p, m, k] = bank.age[p, m, k + 1]
+    mean, cov = bank.mean[p, m], bank.cov[p, m]
+    for i in range(len(mean)):
+        for k in range(slot, last):
+            mean[i, k] = mean[i, k + 1]
+        for j in range(len(mean)):
+            for k in range(slot, last):
+                cov[i, j, k] = cov[i, j, k + 1]
+    bank.log_weight[p, m, last] = -np.inf
+    bank.used[p, m] = last
+
+
+@jit
+def _merge(bank, p, m):
+    """Merge two neighbouring onsets into the heavier: the pair whose ages are relatively closest.
+
+    The sum of the weights stays, so that the statistic stays a martingale.
+    """
+    now, ages = bank.seen[p], bank.age[p, m]
+    at, best = 0, np.inf
+    for k in range(bank.used[p, m] - _SINGLE - 1):
+        ratio = (now - ages[k]) / (now - ages[k + 1])
+        if ratio < best:
+            at, best = k, ratio
+    older, younger = bank.log_weight[p, m, at], bank.log_weight[p, m, at + 1]
+    keep, lose = (at, at + 1) if older >= younger else (at + 1, at)
+    bank.log_weight[p, m, keep] = _log_add(older, younger)
+    _remove(bank, p, m, lose)
+
+
+@jit
+def _open(bank, p, m, number):
+    """Add the onset "from this spot on"."""
+    if bank.used[p, m] > 0 and bank.seen[p] - bank.age[p, m, 0] >= WINDOW:
+        _remove(bank, p, m, 0)
+    if bank.used[p, m] == SLOTS:
+        _merge(bank, p, m)
+    k = bank.used[p, m]
+    bank.log_weight[p, m, k] = math.log(bank.share[m])
+    bank.first[p, m, k] = number
+    bank.age[p, m, k] = bank.seen[p]
+    size = bank.prior.shape[2]
+    for i in range(size):
+        bank.mean[p, m, i, k] = 0.0
+        for j in range(size):
+            bank.cov[p, m, i, j, k] = bank.prior[p, m, i, j]
+    bank.used[p, m] = k + 1
+
+
+@jit
+def _learn(bank, p, m, e, G, good, bad, unchanged, dof):
+    """Multiply every onset by ``q / p`` of this spot and update what it knows of the change.
+
+    ``e = G c + noise`` or an outlier; ``q = good |V|^-1/2 t(e - G mean; V) + bad`` with
+    ``V = I + G cov G^T``; ``p = unchanged``. The spot counts in the update as far as it is
+    probably no outlier (information scaled by that probability): an approximation of the posterior,
+    which costs power at worst, never false alarms.
+    """
+    mean, cov = bank.mean[p, m], bank.cov[p, m]
+    size = len(mean)
+    a, b = np.zeros((size, SLOTS)), np.zeros((size, SLOTS))
+    r0, r1 = np.full(SLOTS, e[0]), np.full(SLOTS, e[1])
+    s00, s01, s11 = np.zeros(SLOTS), np.zeros(SLOTS), np.zeros(SLOTS)
+    for i in range(size):
+        for j in range(size):
+            g0, g1 = G[0, j], G[1, j]
+            for k in range(SLOTS):
+                a[i, k] += g0 * cov[i, j, k]
+                b[i, k] += g1 * cov[i, j, k]
+        g0, g1 = G[0, i], G[1, i]
+        for k in range(SLOTS):
+            r0[k] -= g0 * mean[i, k]
+            r1[k] -= g1 * mean[i, k]
+            s00[k] += g0 * a[i, k]
+            s01[k] += g0 * b[i, k]
+            s11[k] += g1 * b[i, k]
+    largest = -np.inf
+    for k in range(bank.used[p, m]):
+        det = (1.0 + s00[k]) * (1.0 + s11[k]) - s01[k] * s01[k]
+        m2 = ((1.0 + s11[k]) * r0[k] * r0[k] + (1.0 + s00[k]) * r1[k] * r1[k]) / det
+        m2 -= 2.0 * s01[k] * r0[k] * r1[k] / det
+        density = good * expected_density(max(m2, 0.0), dof) / math.sqrt(det)
+        bank.log_weight[p, m, k] += math.log((density + bad) / unchanged)
+        largest = max(largest, bank.log_weight[p, m, k])
+        rho = density / (density + bad)
+        # gain (I / rho + S)^-1, left in s
+        v00, v11, v01 = 1.0 + rho * s00[k], 1.0 + rho * s11[k], rho * s01[k]
+        scale = rho / (v00 * v11 - v01 * v01)
+        s00[k], s01[k], s11[k] = scale * v11, -scale * v01, scale * v00
+    for i in range(size):
+        for k in range(bank.used[p, m]):
+            x0 = s00[k] * a[i, k] + s01[k] * b[i, k]
+            x1 = s01[k] * a[i, k] + s11[k] * b[i, k]
+            mean[i, k] += x0 * r0[k] + x1 * r1[k]
+            for j in range(size):
+                cov[i, j, k] -= x0 * a[j, k] + x1 * b[j, k]
+    total = 0.0
+    for k in range(bank.used[p, m]):
+        total += math.exp(bank.log_weight[p, m, k] - largest)
+    return largest + math.log(total)
+
+
+@jit
+def _look_at_part(bank, p, number, e, G, good, bad, unchanged, dof):
+    """One spot of part ``p``: a new onset, then all of them learn."""
+    total = -np.inf
+    for m in range(bank.log_weight.shape[1]):
+        _open(bank, p, m, number)
+        total = _log_add(total, _learn(bank, p, m, e, G, good, bad, unchanged, dof))
+    bank.log_total[p] = total
+    bank.seen[p] += 1
+
+
+@jit
+def _follow(state, share, number, log_ratio):
+    """One step of a simple Shiryaev-Roberts statistic ``R = (R + share) ratio`` and its onset.
+
+    The most likely onset is where the cumulative sum of the ratios was last lowest (Page 1954).
+    """
+    state[0] = _log_add(state[0], math.log(share)) + log_ratio
+    if state[1] <= 0.0:
+        state[1] = 0.0
+        state[2] = number
+    state[1] += log_ratio
+
+
+@jit
+def _centre(watch, p, G):
+    """Write a plane's prior for a turn about the middle of its spots.
+
+    A spot moves along the normal by ``c_3 + s . (c_1, c_2)``, where ``s`` is read off the Jacobian;
+    independent turn and shift at the mean ``s`` are correlated at the origin.
+    """
+    middle = watch.middle[p]
+    length = G[0, 2] * G[0, 2] + G[1, 2] * G[1, 2]
+    middle[2] = min(middle[2] + 1.0, _MIDDLE)
+    for i in range(2):
+        s = (G[0, 2] * G[0, i] + G[1, 2] * G[1, i]) / length
+        middle[i] += (s - middle[i]) / middle[2]
+    prior = watch.planes.prior[p]
+    for m in range(len(prior)):
+        turn0, turn1 = prior[m, 0, 0], prior[m, 1, 1]
+        # the shift's own variance does not change: take out the old correlation, put in the new
+        shift = prior[m, 2, 2] - prior[m, 0, 2] ** 2 / turn0 - prior[m, 1, 2] ** 2 / turn1
+        prior[m, 0, 2] = prior[m, 2, 0] = -middle[0] * turn0
+        prior[m, 1, 2] = prior[m, 2, 1] = -middle[1] * turn1
+        prior[m, 2, 2] = shift + middle[0] ** 2 * turn0 + middle[1] ** 2 * turn1
+
+
+@jit
+def log_statistic(watch):
+    """Logarithm of the sum of all onsets of all causes."""
+    total = -np.inf
+    for i in range(len(watch.spread)):
+        total = _log_add(total, watch.spread[i, 0])
+    for bank in (watch.cameras.log_total, watch.lasers.log_total, watch.planes.log_total):
+        for p in range(len(bank)):
+            total = _log_add(total, bank[p])
+    for run in (watch.cameras.run, watch.lasers.run, watch.planes.run):
+        for p in range(len(run)):
+            total = _log_add(total, run[p, 0])
+    return total
+
+
+@jit
+def _look(watch, looks, i, out):
+    """One spot; fills ``out`` (4,) as in `look`."""
+    e, area, dof = looks.e[i], looks.area[i], looks.dof[i]
+    camera, laser, plane = looks.who[i, 0], looks.who[i, 1], looks.who[i, 2]
+    number = watch.number[0]
+    rate = outlier_rate(watch, camera, laser, plane)
+    m = e[0] * e[0] + e[1] * e[1]
+    if math.isfinite(m):
+        good, gross = expected_density(m, dof), outlier_density(m, area)
+        if good < 1e-300:
+            good = 0.0
+        unchanged = (1.0 - rate) * good + rate * gross
+        run_ratio = math.log(((1.0 - _RUN_RATE) * good + _RUN_RATE * gross) / unchanged)
+        probability = rate * gross / unchanged
+        # at least the density of outliers of any mixture of the two halves
+        bad = 2.0 * rate * gross
+        p = (1.0 - rate) * good + bad
+        common = (1.0 - rate, bad, p, dof)
+        _centre(watch, plane, looks.by_plane[i])
+        _look_at_part(watch.cameras, camera, number, e, looks.by_camera[i], *common)
+        _look_at_part(watch.lasers, laser, number, e, looks.by_laser[i], *common)
+        _look_at_part(watch.planes, plane, number, e, looks.by_plane[i], *common)
+        for s in range(len(watch.spread)):
+            tau2 = watch.spread_factor[s]
+            wide = (1.0 - rate) * expected_density(m / tau2, dof) / tau2 + bad
+            _follow(watch.spread[s], watch.spread_share[s], number, math.log(wide / p))
+    else:
+        run_ratio, probability, m = math.log(_RUN_RATE / rate), 1.0, np.inf
+    _follow(watch.cameras.run[camera], watch.cameras.run_share[0], number, run_ratio)
+    _follow(watch.lasers.run[laser], watch.lasers.run_share[0], number, run_ratio)
+    _follow(watch.planes.run[plane], watch.planes.run_share[0], number, run_ratio)
+    row = watch.recent[number % len(watch.recent)]
+    row[0], row[1], row[2], row[3] = probability, camera, laser, plane
+    _count(watch, number)
+    watch.number[0] = number + 1
+    out[0], out[1] = log_statistic(watch), math.sqrt(m)
+    out[2], out[3] = gate_length(rate, area, dof), probability
+
+
+@jit
+def look(watch, looks, log_threshold, out):
+    """Look at spots in order until the first alarm; returns how many were looked at.
+
+    ``out`` (N, 4): logarithm of the statistic, length, limit, probability to be an outlier.
+    """
+    for i in range(len(looks.e)):
+        _look(watch, looks, i, out[i])
+        if out[i, 0] >= log_threshold:
+            return i + 1
+    return len(looks.e)

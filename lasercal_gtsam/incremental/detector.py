@@ -1,0 +1,283 @@
+"""Notice, spot by spot, that something is no longer as it was, and since when.
+
+Every spot is compared with what was expected before it was used. Two kinds of change are watched
+for in each part: a shift of a few magnitudes, whose pixels agree with each other through the
+Jacobians, and a run of gross outliers (bumped beyond prediction); besides, residuals wider than
+declared (the robot). All are likelihood ratios against "unchanged, with outliers at their running
+rate", summed over the possible onsets: the statistic of Shiryaev (1963) and Roberts (1966). An
+alarm is raised where it reaches the threshold, which is then a lower bound for the mean number of
+good spots between false alarms (Pollak 1985); see `lasercal_factors.change_kernels`.
+
+A sluggish calibrator absorbs part of a lasting change; the ratios neglect that (Willsky and Jones
+1976 do not), which costs power for changes that need about as many spots as there were before, and
+never a false alarm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from lasercal_factors import change_kernels as kernels
+from lasercal_factors.change_arrays import LAG, Bank, Looks, Watch
+
+from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.incremental.detector_state import (
+    KINDS,
+    covering,
+    empty_watch,
+    forget_evidence,
+    from_arrays,
+    to_arrays,
+)
+
+DEFAULT_THRESHOLD = 100_000.0
+
+
+class Look(NamedTuple):
+    """A spot as it came, compared with what was expected before it was used.
+
+    Attributes
+    ----------
+    e : (2,) whitened innovation, identity covariance where nothing has changed; NaN where the
+        estimate says that no spot should be
+    camera, laser, plane : indices of the parts
+    by_camera : (2, 6) whitened derivative of the pixel by rotation (rad) and translation (m)
+    by_laser : (2, 4) by slopes (rad) and offsets (m)
+    by_plane : (2, 3) by tilt (rad) and distance (m)
+    area : of the picture in whitened units: width * height / sqrt(det covariance)
+    dof : degrees of freedom of the noise scale; inf where the noise is known
+    """
+
+    e: npt.ArrayLike
+    camera: int
+    laser: int
+    plane: int
+    by_camera: npt.ArrayLike
+    by_laser: npt.ArrayLike
+    by_plane: npt.ArrayLike
+    area: float
+    dof: float
+
+
+class Verdict(NamedTuple):
+    """What a spot says.
+
+    Attributes
+    ----------
+    outlier : more probably a gross outlier than a good spot of an unchanged cell
+    reason : why, with its length and the limit; "" for a good spot
+    alarm : something has changed
+    since : number of the first spot that is affected, counted from the detector's start at 0; None
+        without an alarm
+    statistic : evidence for a change, as a fraction of the threshold on a logarithmic scale: alarm
+        at 1
+    length, limit : of the innovation (sigma) and from which on a spot is an outlier
+    """
+
+    outlier: bool
+    reason: str
+    alarm: bool
+    since: int | None
+    statistic: float
+    length: float
+    limit: float
+
+
+class Onset(NamedTuple):
+    """A cause and a spot it may have begun with: kind, index, first spot, log weight."""
+
+    kind: str
+    part: int
+    first: int
+    log_weight: float
+
+
+@dataclass
+class Detector:
+    """Sequential test for a change; changed in place by `look`, deterministic.
+
+    Attributes
+    ----------
+    watch : the whole state as plain arrays (`lasercal_factors.change_kernels.Watch`)
+    threshold : lower bound of the mean number of good spots to a false alarm
+    """
+
+    watch: Watch
+    threshold: float = DEFAULT_THRESHOLD
+    _out: Array = field(default_factory=lambda: np.empty((1, 4)), repr=False)
+
+    @classmethod
+    def start(
+        cls,
+        cameras: int = 1,
+        lasers: int = 1,
+        planes: int = 1,
+        *,
+        outliers: float = 0.0,
+        good: float = 0.0,
+        threshold: float = DEFAULT_THRESHOLD,
+    ) -> Detector:
+        """Begin with that many parts.
+
+        Parameters
+        ----------
+        cameras, lasers, planes : numbers of parts; more may come later (`cover`)
+        outliers, good : spots seen before, rejected and used: where the rate of outliers starts
+        threshold : alarm threshold, > 1
+
+        Raises
+        ------
+        DataError
+            A number that makes no sense.
+        """
+        if not threshold > 1 or not math.isfinite(threshold):
+            raise DataError(f"detector threshold: expected a number of spots > 1, got {threshold}")
+        if not (outliers >= 0 and good >= 0 and math.isfinite(outliers + good)):
+            raise DataError(f"detector: expected counts >= 0, got {outliers} outliers, {good} good")
+        watch = empty_watch(cameras, lasers, planes, outliers, outliers + good)
+        return cls(watch, float(threshold))
+
+    @property
+    def number(self) -> int:
+        """Spots looked at since the start."""
+        return int(self.watch.number[0])
+
+    @property
+    def outlier_rate(self) -> float:
+        """Running rate of outliers over all parts."""
+        return float(kernels.overall_rate(self.watch.outliers))
+
+    def cover(self, cameras: int, lasers: int, planes: int) -> None:
+        """Make room for at least so many parts; new ones start with nothing seen."""
+        self.watch = covering(self.watch, cameras, lasers, planes)
+
+    def look(self, spot: Look) -> Verdict:
+        """Take in one spot.
+
+        Raises
+        ------
+        DataError
+            Shapes, indices or numbers that cannot be.
+        """
+        return self.look_many(_looks(spot))[0]
+
+    def look_many(self, looks: Looks) -> list[Verdict]:
+        """Take in spots in order, up to the first alarm: may return fewer verdicts than spots."""
+        self._check(looks)
+        out = self._out if len(looks.e) == 1 else np.empty((len(looks.e), 4))
+        log_threshold = math.log(self.threshold)
+        count = kernels.look(self.watch, looks, log_threshold, out)
+        return [self._verdict(row, log_threshold) for row in out[:count].tolist()]
+
+    def reset(self, since: int | None = None) -> None:
+        """Forget all evidence; the rates of outliers stay.
+
+        Parameters
+        ----------
+        since : from this spot on, nothing counts as an outlier any more either (a part had moved)
+        """
+        if since is not None:
+            self._uncount(since)
+        forget_evidence(self.watch)
+
+    def onsets(self) -> list[Onset]:
+        """Every onset that is considered, with its weight, the heaviest first."""
+        found = []
+        for kind in KINDS:
+            bank: Bank = getattr(self.watch, kind)
+            for p, m, k in zip(*np.nonzero(np.isfinite(bank.log_weight)), strict=True):
+                first, weight = int(bank.first[p, m, k]), float(bank.log_weight[p, m, k])
+                found.append(Onset(kind, int(p), first, weight))
+            for p, (weight, _, first) in enumerate(bank.run.tolist()):
+                found.append(Onset(f"run of {kind}", p, int(first), weight))
+        for weight, _, first in self.watch.spread.tolist():
+            found.append(Onset("spread", 0, int(first), weight))
+        return sorted((o for o in found if o.log_weight > -np.inf), key=lambda o: -o.log_weight)
+
+    def since(self) -> int | None:
+        """Most probable first spot of a change, over all causes; None before the first spot."""
+        weights: dict[int, float] = {}
+        onsets = self.onsets()
+        for o in onsets:
+            weights[o.first] = weights.get(o.first, 0.0) + math.exp(
+                o.log_weight - onsets[0].log_weight
+            )
+        return max(weights, key=lambda first: (weights[first], first)) if weights else None
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Return copies of the whole state by name, for a checkpoint."""
+        return {"threshold": np.array(self.threshold), **to_arrays(self.watch)}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, npt.NDArray[Any]]) -> Detector:
+        """Undo `arrays`: goes on with exactly the same numbers.
+
+        Raises
+        ------
+        DataError
+            An array is missing or is not what it must be.
+        """
+        if "threshold" not in arrays:
+            raise DataError("detector: the saved state has no array 'threshold'")
+        return cls(from_arrays(arrays), float(arrays["threshold"]))
+
+    def _verdict(self, row: list[float], log_threshold: float) -> Verdict:
+        log_statistic, length, limit, probability = row
+        outlier, alarm = probability > 0.5, log_statistic >= log_threshold
+        reason = ""
+        if outlier and math.isinf(length):
+            reason = "no spot should be there at all"
+        elif outlier:
+            reason = f"{length:.3g} sigma from where it was expected; the limit is {limit:.3g}"
+        since = self.since() if alarm else None
+        return Verdict(outlier, reason, alarm, since, log_statistic / log_threshold, length, limit)
+
+    def _check(self, looks: Looks) -> None:
+        n = len(looks.e)
+        shapes = ((n, 2), (n, 3), (n, 2, 6), (n, 2, 4), (n, 2, 3), (n,), (n,))
+        for name, array, shape in zip(Looks._fields, looks, shapes, strict=True):
+            if array.shape != shape:
+                raise DataError(f"detector: {name}: expected shape {shape}, got {array.shape}")
+        parts = [len(getattr(self.watch, kind).seen) for kind in KINDS]
+        if n and not (np.all(looks.who >= 0) and np.all(looks.who < parts)):
+            raise DataError(f"detector: a part's index is out of range: there are {parts}")
+        if not (np.all(looks.area > 0) and np.all(looks.dof > 0)):
+            raise DataError("detector: area and degrees of freedom must be positive")
+        possible = np.isfinite(looks.e).all(axis=1)
+        for name in ("by_camera", "by_laser", "by_plane"):
+            if not np.isfinite(getattr(looks, name)[possible]).all():
+                raise DataError(f"detector: {name}: expected finite numbers")
+
+    def _uncount(self, since: int) -> None:
+        watch = self.watch
+        for i in range(max(since, self.number - len(watch.recent), 0), self.number):
+            probability, *parts = watch.recent[i % len(watch.recent)]
+            watch.outliers[0] = max(watch.outliers[0] - probability, 0.0)
+            counted = KINDS if i < self.number - LAG else ()
+            for kind, p in zip(counted, parts, strict=False):
+                counts = getattr(watch, kind).outliers[int(p)]
+                counts[0] = max(counts[0] - probability, 0.0)
+            watch.recent[i % len(watch.recent), 0] = 0.0
+
+
+def _looks(spot: Look) -> Looks:
+    """One spot as arrays."""
+
+    def one(value: npt.ArrayLike) -> Array:
+        return np.ascontiguousarray(value, dtype=np.float64)[None]
+
+    return Looks(
+        one(spot.e),
+        np.array([[spot.camera, spot.laser, spot.plane]], dtype=np.int64),
+        one(spot.by_camera),
+        one(spot.by_laser),
+        one(spot.by_plane),
+        one(spot.area),
+        one(spot.dof),
+    )
