@@ -314,6 +314,7 @@ class CaptureFollower:
     # --- pictures, ends, words ------------------------------------------------------------------
 
     def _look_at_pictures(self) -> Iterator[Observations | Notice]:
+        before = len(self._pictured)
         for label, row in list(self._pictured.items()):
             if self._desk is None:
                 self.waiting[label] = "there is no pixel u, v for it yet"
@@ -342,6 +343,8 @@ class CaptureFollower:
                 )
                 self._known.add(taken, self._where)
                 yield taken
+        # a picture may have been the last one that others waited for
+        self.soon = self.soon or 0 < len(self._pictured) < before
 
     def _look_at_head(self) -> Iterator[Notice]:
         status = self._head_status()

@@ -129,9 +129,12 @@ class PictureDesk:
         owner = self._owned(on, names)
         if owner != names["id"]:
             return Fault(f"the picture {on} is already that of id {owner}")
-        if wait := self._not_whole(on, "picture"):
+        wait = self._not_whole(on, "picture")
+        off = None if self._alone else self._off(names, there=wait is None)
+        if wait is None and self._alone:
+            wait = self._enough(names, on)
+        if wait is not None:
             return wait
-        off = self._enough(names, on) if self._alone else self._off(names)
         if isinstance(off, Wait):
             return off
         paths = [on] if off is None else [on, off]
@@ -191,7 +194,8 @@ class PictureDesk:
             self._files[path] = known = _File(key, old=old)
         return None if known.whole else Wait(f"the {kind} {path} is still being written", True)
 
-    def _off(self, names: Names) -> Path | Wait:
+    def _off(self, names: Names, there: bool) -> Path | Wait:
+        """Laser-off picture of a row; ``there``: its laser-on picture is."""
         own, shared = self._images.off, self._images.background
         wait = None
         if own is not None:
@@ -199,7 +203,7 @@ class PictureDesk:
             wait = self._not_whole(path, "laser-off picture")
             if wait is None:
                 return path
-            looks = self._without_off[names["id"]] = self._without_off.get(names["id"], 0) + 1
+            looks = self._without_off[names["id"]] = self._without_off.get(names["id"], 0) + there
             if shared is None or path.exists() or looks <= PATIENCE:
                 return wait
         assert shared is not None
@@ -215,12 +219,11 @@ class PictureDesk:
         """Whether there are pictures enough to make a laser-off picture of; counts this one."""
         scene = self._scene(names)
         scene.add(names["id"], on)
-        missing = MIN_ROWS - len(scene.recent)
-        if missing <= 0:
+        if len(scene.recent) >= MIN_ROWS:
             return None
         return Wait(
-            f"there is no laser-off picture; {missing} more laser-on pictures of {_about(names)} "
-            "can make one"
+            f"there is no laser-off picture; {MIN_ROWS} laser-on pictures of {_about(names)} can "
+            "make one, and there are fewer yet"
         )
 
     def _stand_in(self, names: Names, on: Picture) -> Picture | None:
