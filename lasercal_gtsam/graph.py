@@ -72,7 +72,7 @@ class CellGraph:
         batch = self.batch if self.scale == 1.0 else self.batch.scaled(self.scale)
         graph.add(LaserCellFactor(CELL_KEY, self.chart, batch, self.loss, self.holds.held))
         if self.holds.priors:
-            graph.add(_prior_factor(self.chart, self.holds, self.start))
+            graph.add(prior_factor(self.chart, self.holds, self.start))
         return graph
 
     def start_values(self) -> gtsam.Values:
@@ -213,7 +213,7 @@ def _ordered(cell: Cell, observations: Observations) -> Cell:
     return Cell(*parts)
 
 
-def _prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFactor:
+def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFactor:
     """All priors as one factor: (row of the table - mean) / sigma; ``aspect`` by its logarithm."""
     charts = {name: BeamChart.of(beam) for name, beam in start.lasers.items()}
     rows = report_map.row_names(start, charts)

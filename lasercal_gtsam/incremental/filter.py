@@ -20,7 +20,7 @@ import numpy.typing as npt
 from lasercal_factors import kernels, stream_kernels
 from lasercal_factors.arrays import State
 from lasercal_factors.chart import BEAM_DIM, CAMERA_DIM, PLANE_DIM, CellChart
-from lasercal_factors.stream_kernels import Weighing, View
+from lasercal_factors.stream_kernels import View, Weighing
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
@@ -31,6 +31,7 @@ from lasercal_gtsam.incremental.belief import (
     carried,
     cell_tangent_map,
     expansion,
+    marginalised,
 )
 from lasercal_gtsam.incremental.store import SpotStore
 from lasercal_gtsam.robust import rejection_length
@@ -41,7 +42,9 @@ Index = npt.NDArray[np.int64]
 Prior = Callable[[Array], Array]
 
 # spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
-SLICE, SLICE_HAND = 1000, 250
+SLICE, SLICE_HAND = 600, 200
+# up to this many spots, all are relinearised within the update
+FEW = 1000
 # joint distance in sigmas from the point of linearisation at which a pass begins
 _MOVED = 0.05
 # where a pass is done within the update: distance at which the estimate has settled
@@ -190,6 +193,9 @@ class Filter:
     noise : of the hand, and fading
     start : where to begin (n,); the reference if left out
     scale : a-posteriori scale to begin with
+    robust : whether outliers are left out
+    open : (n,) coordinates that are not determined yet
+    end : spots before this one are there already; marks count once `relinearise` has run
     """
 
     def __init__(
@@ -205,12 +211,15 @@ class Filter:
         noise: Weighing | None = None,
         start: Array | None = None,
         scale: float = 1.0,
+        robust: bool = True,
+        open: Mask | None = None,
+        end: int | None = None,
     ) -> None:
         self.store, self.template = store, cell
         self.chart = CellChart(state_from_cell(cell), aspects)
         n = self.chart.n
         self.held = held.copy()
-        self.open = np.zeros(n, np.bool_)
+        self.open = np.zeros(n, np.bool_) if open is None else open
         self.noise = noise or Weighing(np.zeros(6), 1.0)
         self.prior = np.zeros((n + 1, n + 1)) if prior is None else prior
         self.prior_rows = prior_rows
@@ -221,7 +230,10 @@ class Filter:
         self._paths, self._offsets = np.empty((0, 3), np.int64), np.empty((0, 4), np.int64)
         self._pass: _Pass | None = None
         self._judged = 0
+        self.end = store.first if end is None else end
+        self.folded = 0.0
         self.scale = scale
+        self.robust = robust
         self.fallbacks = 0
         self._linear = self._at(np.zeros(n) if start is None else start)
         self._unknowns = self._count_unknowns()
@@ -249,7 +261,12 @@ class Filter:
     @property
     def limit(self) -> float:
         """Whitened residual length (a-priori sigmas) beyond which a spot is an outlier."""
-        return rejection_length(len(self.store)) * self.scale
+        return rejection_length(self.count) * self.scale if self.robust else float("inf")
+
+    @property
+    def count(self) -> int:
+        """Spots taken in and still stored."""
+        return self.end - self.store.first
 
     @property
     def moved(self) -> float:
@@ -272,6 +289,7 @@ class Filter:
     def use(self, begin: int, end: int) -> None:
         """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew."""
         self._learn_paths()
+        self.end = end
         if self.noise.fade < 1.0:
             self._fade(self.noise.fade ** (end - begin))
         self._add(self._linear, begin, end)
@@ -279,14 +297,14 @@ class Filter:
 
     def settle(self) -> None:
         """Relinearise: at once where there are few spots, else a bounded share of it."""
-        if len(self.store) <= self._slice:
+        if self.count <= FEW:
             self.relinearise(_SETTLED)
             return
         if self._pass is None and (self.moved > _MOVED or self._grown()):
             self._pass = self._new_pass()
         if self._pass is not None:
             self._advance(self._pass)
-            if self._pass.at >= self.store.end:
+            if self._pass.at >= self.end:
                 self._take_over(self._pass)
 
     def relinearise(self, settled: float = 0.0) -> None:
@@ -296,7 +314,7 @@ class Filter:
             if (k or settled) and self.moved <= (settled or _SETTLED) and not self._grown():
                 return
             self._pass = self._new_pass()
-            while self._pass.at < self.store.end:
+            while self._pass.at < self.end:
                 self._advance(self._pass)
             if not self._take_over(self._pass):
                 return
@@ -304,29 +322,42 @@ class Filter:
     def take_out(self, begin: int, end: int, mark: int) -> None:
         """Take the spots begin ... end-1 out of the estimate and mark them."""
         self._learn_paths()
-        part = replace(
-            self._linear, H=np.zeros_like(self._linear.H), sums=np.zeros_like(self._linear.sums)
-        )
-        self._add(part, begin, end)
-        self._linear.H = self._linear.H - part.H
-        self._linear.sums = self._linear.sums - part.sums
+        self._subtract(begin, end)
         self.store.mark(begin, end, mark)
         self._pass = None
         self._solve()
 
     def fold(self, end: int) -> None:
         """Turn the spots before ``end`` into prior knowledge and let them go."""
-        part = replace(
-            self._linear, H=np.zeros_like(self._linear.H), sums=np.zeros_like(self._linear.sums)
-        )
-        self._add(part, self.store.first, end)
-        self._linear.H = self._linear.H - part.H
-        self._linear.sums = self._linear.sums - part.sums
+        part = self._subtract(self.store.first, end)
         self.prior = self.prior + about_origin(part.H, self._linear.z)
         self.prior_rows += 2.0 * float(part.sums[0])
+        self.folded += float(part.sums[0])
         self.store.forget(end)
         self._pass = None
         self._solve()
+
+    def forget_part(self, columns: slice) -> None:
+        """What the prior knows of these coordinates is forgotten; they are open from now on."""
+        prior, (held, *ties) = self.prior.copy(), self._constraints
+        kernels.constrain(prior, held, *ties)
+        prior[:-1, :-1][held, held] = 0.0
+        self.prior = marginalised(prior, columns, np.append(held, False))
+        free = np.zeros_like(held)
+        free[columns] = True
+        self.prior_rows -= float((free & ~held).sum())
+        self.open[columns] = True
+        self._unknowns = self._count_unknowns()
+        self._pass = None
+        self._solve()
+
+    def _subtract(self, begin: int, end: int) -> _Linear:
+        """Take spots out of the linearisation as they are marked; what they were."""
+        linear = self._linear
+        part = replace(linear, H=np.zeros_like(linear.H), sums=np.zeros_like(linear.sums))
+        self._add(part, begin, end)
+        linear.H, linear.sums = linear.H - part.H, linear.sums - part.sums
+        return part
 
     # --- inside ---------------------------------------------------------------------------------
 
@@ -370,10 +401,10 @@ class Filter:
         return _Linear(z, view, np.zeros((size, size)), soft, np.zeros(3))
 
     def _grown(self) -> bool:
-        return len(self.store) > _GROWN * self._judged
+        return self.count > _GROWN * self._judged
 
     def _new_pass(self) -> _Pass:
-        self._judged = len(self.store)
+        self._judged = self.count
         return _Pass(self._at(self.z), self.store.first)
 
     def _fade(self, factor: float) -> None:
@@ -384,8 +415,8 @@ class Filter:
             linear.H = factor * linear.H
             linear.sums = factor * linear.sums
         horizon = int(np.log(_FADED) / np.log(self.noise.fade))
-        if self._pass is None and len(self.store) > 2 * horizon:
-            self.store.forget(self.store.end - horizon)
+        if self._pass is None and self.count > 2 * horizon:
+            self.store.forget(self.end - horizon)
 
     def _add(
         self, linear: _Linear, begin: int, end: int, judge: bool = False
@@ -394,7 +425,7 @@ class Filter:
         found = []
         for first, (records, path, mark) in self.store.slices(begin, end):
             marks = mark.copy() if judge else mark
-            age = self.store.end - 1 - first
+            age = self.end - 1 - first
             H, sums = stream_kernels.accumulate(
                 records, path, marks, linear.view, self.noise, self.limit, judge, age
             )
@@ -404,7 +435,7 @@ class Filter:
         return found
 
     def _advance(self, running: _Pass) -> None:
-        end = min(running.at + self._slice, self.store.end)
+        end = min(running.at + self._slice, self.end)
         running.marks += self._add(running.linear, running.at, end, judge=True)
         running.at = end
 
@@ -437,7 +468,7 @@ class Filter:
             prior = about_point(self.prior, linear.z) + linear.soft + extra
             _, z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
             trial = _Pass(self._at(z), self.store.first)
-            while trial.at < self.store.end:
+            while trial.at < self.end:
                 self._advance(trial)
             found = self._loss(trial.linear)
             if found < loss:

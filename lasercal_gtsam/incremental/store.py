@@ -6,7 +6,7 @@ costs the same whatever came before. Old segments can be let go.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -91,6 +91,10 @@ class SpotStore:
         parts = [s[2] for _, s in self.slices(self._from(begin), self._to(end))]
         return np.concatenate(parts) if parts else np.empty(0, np.uint8)
 
+    def mark_of(self, number: int) -> int:
+        """What the estimate does with a spot."""
+        return int(self._segments[number // SEGMENT][2][number % SEGMENT])
+
     def label(self, number: int) -> str:
         """Label of a spot."""
         return self._labels[number // SEGMENT][number % SEGMENT]
@@ -102,7 +106,13 @@ class SpotStore:
     def observations(self, begin: int | None = None, end: int | None = None) -> Observations:
         """The spots begin ... end-1 (all that are stored, if left out) as they were given."""
         begin, end = self._from(begin), self._to(end)
-        pieces = [s for _, s in self.slices(begin, end)]
+        return self._given([s for _, s in self.slices(begin, end)], range(begin, end))
+
+    def chosen(self, numbers: Sequence[int]) -> Observations:
+        """Those spots as they were given."""
+        return self._given([s for n in numbers for _, s in self.slices(n, n + 1)], numbers)
+
+    def _given(self, pieces: Sequence[Slice], numbers: Sequence[int]) -> Observations:
         records = np.concatenate([p[0] for p in pieces]) if pieces else np.empty((0, RECORD))
         index = np.concatenate([p[1] for p in pieces]) if pieces else np.empty(0, np.int32)
         names = np.array([path[:3] for path in self.paths], dtype=np.str_).reshape(-1, 3)[index]
@@ -116,7 +126,7 @@ class SpotStore:
             camera=names[:, 0],
             laser=names[:, 1],
             plane=names[:, 2],
-            id=np.array([self.label(k) for k in range(begin, end)], dtype=np.str_),
+            id=np.array([self.label(k) for k in numbers], dtype=np.str_),
             image_size=self.image_size,
         )
 

@@ -149,7 +149,6 @@ class Update:
     events : what happened in this update
     n_spots : spots given so far, all of them
     n_used : spots in the estimate
-    cell : the estimate (parts that are determined); None while collecting
     sigma0 : residual scale, as `Fit.sigma0`; NaN while collecting
     rms_px : residual RMS over the spots used, to the linearisation; NaN while collecting
     """
@@ -164,11 +163,16 @@ class Update:
     events: tuple[Event, ...]
     n_spots: int
     n_used: int
-    cell: Cell | None
     sigma0: float
     rms_px: float
+    _cell: Callable[[], Cell | None] = field(repr=False)
     _parameters: Callable[[], tuple[Parameter, ...]] = field(repr=False)
     _calibration: Callable[[], Calibration | None] = field(repr=False)
+
+    @cached_property
+    def cell(self) -> Cell | None:
+        """The estimate as it stood after this update; None while collecting."""
+        return self._cell()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
