@@ -13,7 +13,7 @@ from lasercal_gtsam.cell import Beam, Cell
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.incremental.belief import Part
 from lasercal_gtsam.observations import Observations
-from lasercal_gtsam.projection import spot_on_beam
+from lasercal_gtsam.projection import spot_triangulated
 from lasercal_gtsam.rotations import basis_of, rotation_log
 
 TURNS: dict[Part, int] = {"camera": 3, "laser": 2, "plane": 2}
@@ -42,19 +42,20 @@ def change_basis(cell: Cell, kind: Part, name: str, middle: Array) -> Array:
 
 
 def middle_of_spots(cell: Cell, observations: Observations, plane: str) -> Array:
-    """Mean of the spots on a plane (3,), base, metres; the foot from the origin if there are none.
+    """Point of a plane (3,) in the middle of its spots, base, metres.
 
-    Spots are taken where the beams hit the plane; where a beam misses it there is none.
+    The spots are triangulated (14), so that they need not lie on the plane as it is in the cell;
+    their median is dropped onto it. The foot from the base origin if there are none.
     """
-    rows = np.flatnonzero(observations.plane == plane)
-    points = spot_on_beam(
-        cell,
-        observations.T_base_hand[rows],
-        plane=plane,
-        laser=observations.laser[rows].tolist(),
+    seen = observations[observations.plane == plane]
+    points = spot_triangulated(
+        cell, seen.uv, seen.T_base_hand, camera=seen.camera.tolist(), laser=seen.laser.tolist()
     )
     points = points[np.isfinite(points).all(axis=1)]
-    return np.asarray(points.mean(axis=0) if len(points) else cell.planes[plane].vector)
+    part = cell.planes[plane]
+    middle = np.median(points, axis=0) if len(points) else part.vector
+    n = part.normal_base
+    return np.asarray(middle + (part.distance - float(n @ middle)) * n)
 
 
 def change_between(
