@@ -188,6 +188,21 @@ def _moved_hand(hand, eta):
 
 
 @jit
+def _covariance(w00, w01, w11):
+    """Covariance ``(W^T W)^-1`` of a whitening: its upper triangle."""
+    v = 1.0 / (w11 * w11)
+    return (1.0 + w01 * w01 * v) / (w00 * w00), -w01 * v / w00, v
+
+
+@jit
+def _whitening(s00, s01, s11):
+    """``w00, w01, w11`` of upper triangular ``W`` with ``W^T W`` the inverse of a covariance."""
+    det = s00 * s11 - s01 * s01
+    w00 = math.sqrt(s11 / det)
+    return w00, -s01 / (det * w00), 1.0 / math.sqrt(s11)
+
+
+@jit
 def correct_hands(spots, state, hand):
     """Move every hand pose to where it most likely was, in place; `hand_noise` has the method.
 
@@ -195,14 +210,10 @@ def correct_hands(spots, state, hand):
     """
     for block in spots.blocks:
         for k in range(block[3], block[4]):
-            w00, w01, w11 = spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k]
-            # inverse of W^T W
-            c11 = 1.0 / (w11 * w11)
-            c01 = -w01 / (w00 * w11 * w11)
-            c00 = 1.0 / (w00 * w00) + w01 * w01 / (w00 * w00 * w11 * w11)
+            c00, c01, c11 = _covariance(spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k])
             commanded = spots.hands[:, k].copy()
             eta, moved, at = np.zeros(6), commanded, commanded
-            last = (c00, c01, c11, 1.0, 0.0, 0.0)
+            last = (c00, c01, c11, 0.0, 0.0)
             good = True
             for _ in range(_HAND_ROUNDS + 1):
                 uv, B = _by_hand(moved, block, state)
@@ -222,7 +233,7 @@ def correct_hands(spots, state, hand):
                 for j in range(6):
                     shift0 += B[0, j] * eta[j]
                     shift1 += B[1, j] * eta[j]
-                last = (s00, s01, s11, det, shift0, shift1)
+                last = (s00, s01, s11, shift0, shift1)
                 at = moved
                 g0, g1 = (s11 * r0 - s01 * r1) / det, (s00 * r1 - s01 * r0) / det
                 eta = np.empty(6)
@@ -231,14 +242,12 @@ def correct_hands(spots, state, hand):
                 moved = _moved_hand(commanded, eta)
             if not good:
                 continue
-            s00, s01, s11, det, shift0, shift1 = last
+            s00, s01, s11, shift0, shift1 = last
             spots.hands[:, k] = at
             spots.pixels[0, k] += shift0
             spots.pixels[1, k] += shift1
-            w00 = math.sqrt(s11 / det)
-            spots.pixels[2, k] = w00
-            spots.pixels[3, k] = -s01 / (det * w00)
-            spots.pixels[4, k] = 1.0 / math.sqrt(s11)
+            w00, w01, w11 = _whitening(s00, s01, s11)
+            spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k] = w00, w01, w11
 
 
 @jit
@@ -357,7 +366,7 @@ def estimate(H, prior, z, held, tie_from, tie_to, tie_ratio):
 
 
 @jit
-def expect(record, path, view, now, R, noise, held, tie_from, tie_to, tie_ratio):
+def expect(record, path, view, now, R, weighing, scale, held, tie_from, tie_to, tie_ratio):
     """How one new spot compares with the estimate, before it is used.
 
     Parameters
@@ -365,38 +374,33 @@ def expect(record, path, view, now, R, noise, held, tie_from, tie_to, tie_ratio)
     record (14,), path : the spot
     view : where ``R`` is linearised; now : the state of the estimate itself
     R, held, ties : as `estimate` has them
+    scale : of the a-priori sigmas
 
     Returns
     -------
-    residual (2,) px, predicted minus seen; NaN where no spot can be
-    W (3,) : ``w00, w01, w11``, whitening by the spot's own noise (pixel and hand)
-    C (2, 2) : covariance of the whitened residual, ``I`` and the estimate's share
-    J (2, 22) : whitened derivatives by the path's own coordinates, as `kernels.rows`
+    residual (2,) : predicted minus seen, px; NaN where no spot can be
+    covariance (2, 2) : of it, by the spot's own noise (pixel and hand) and the estimate's, px^2
+    e (2,) : residual, whitened by that covariance
+    G (2, 13) : derivatives, whitened alike, by what may move: camera pose 6, beam 4, plane 3 (its
+        distance as ``n . x = d``)
     """
     n = len(view.M)
     one = np.empty(1, np.int64)
     one[0] = path
     spots, _, offsets = gather(record.reshape(1, -1), one, view)
-    state = view.state
     r = residuals(spots, now)[0]
-    if np.any(noise.hand > 0.0):
+    w = spots.pixels[2:, 0]
+    if np.any(weighing.hand > 0.0):
         # with the noise of the hand, but at the commanded pose
         _, B = _by_hand(spots.hands[:, 0].copy(), spots.blocks[0], now)
-        w00, w01, w11 = spots.pixels[2, 0], spots.pixels[3, 0], spots.pixels[4, 0]
-        s11 = 1.0 / (w11 * w11)
-        s01 = -w01 / (w00 * w11 * w11)
-        s00 = 1.0 / (w00 * w00) + w01 * w01 / (w00 * w00 * w11 * w11)
+        s00, s01, s11 = _covariance(w[0], w[1], w[2])
         for j in range(6):
-            s00 += B[0, j] * noise.hand[j] * B[0, j]
-            s01 += B[0, j] * noise.hand[j] * B[1, j]
-            s11 += B[1, j] * noise.hand[j] * B[1, j]
-        det = s00 * s11 - s01 * s01
-        if math.isfinite(det) and det > 0.0:
-            w00 = math.sqrt(s11 / det)
-            spots.pixels[2, 0] = w00
-            spots.pixels[3, 0] = -s01 / (det * w00)
-            spots.pixels[4, 0] = 1.0 / math.sqrt(s11)
-    J = rows(spots, state)[0]
+            s00 += B[0, j] * weighing.hand[j] * B[0, j]
+            s01 += B[0, j] * weighing.hand[j] * B[1, j]
+            s11 += B[1, j] * weighing.hand[j] * B[1, j]
+        if math.isfinite(s00 * s11 - s01 * s01):
+            w[0], w[1], w[2] = _whitening(s00, s01, s11)
+    J = rows(spots, view.state)[0]
     A = np.zeros((2, n))
     start = (0, 6, 15, 19)
     size = (6, 9, 4, 3)
@@ -410,7 +414,7 @@ def expect(record, path, view, now, R, noise, held, tie_from, tie_to, tie_ratio)
                 A[i, at + j] = v
     for t in range(len(tie_from)):
         A[:, tie_to[t]] += tie_ratio[t] * A[:, tie_from[t]]
-    C = np.eye(2)
+    # covariance of the residual, whitened by the spot's own noise: I + V V^T, R^T V^T = A^T
     V = np.zeros((2, n))
     for i in range(2):
         for j in range(n):
@@ -420,8 +424,31 @@ def expect(record, path, view, now, R, noise, held, tie_from, tie_to, tie_ratio)
             for k in range(j):
                 v -= R[k, j] * V[i, k]
             V[i, j] = v / R[j, j]
-    for i in range(2):
-        for j in range(2):
-            for k in range(n):
-                C[i, j] += V[i, k] * V[j, k]
-    return r, spots.pixels[2:, 0].copy(), C, J[:, :22].copy()
+    c00 = c11 = 1.0
+    c01 = 0.0
+    for k in range(n):
+        c00 += V[0, k] * V[0, k]
+        c01 += V[0, k] * V[1, k]
+        c11 += V[1, k] * V[1, k]
+    # by its Cholesky factor, times the scale
+    l00 = math.sqrt(c00)
+    l10 = c01 / l00
+    l11 = math.sqrt(max(c11 - l10 * l10, 1e-300))
+    b00, b10, b11 = 1.0 / (scale * l00), -l10 / (scale * l00 * l11), 1.0 / (scale * l11)
+    e = np.empty(2)
+    first, second = w[0] * r[0] + w[1] * r[1], w[2] * r[1]
+    e[0], e[1] = b00 * first, b10 * first + b11 * second
+    G = np.empty((2, 13))
+    for j in range(13):
+        k = j if j < 6 else j + 9
+        sign = -1.0 if j == 12 else 1.0
+        G[0, j] = sign * b00 * J[0, k]
+        G[1, j] = sign * (b10 * J[0, k] + b11 * J[1, k])
+    # back to pixels: W^-1 C W^-T
+    u00, u01, u11 = 1.0 / w[0], -w[1] / (w[0] * w[2]), 1.0 / w[2]
+    covariance = np.empty((2, 2))
+    covariance[0, 0] = u00 * u00 * c00 + 2.0 * u00 * u01 * c01 + u01 * u01 * c11
+    covariance[0, 1] = u11 * (u00 * c01 + u01 * c11)
+    covariance[1, 0] = covariance[0, 1]
+    covariance[1, 1] = u11 * u11 * c11
+    return r, scale * scale * covariance, e, G

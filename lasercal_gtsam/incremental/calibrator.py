@@ -131,7 +131,7 @@ class IncrementalCalibrator:
         self._since = 0
         self._events: list[Event] = []
         self._reported = 0
-        self._history: list[HistoryRow] = []
+        self._history: list[Update] = []
         self._next_row, self._next_audit = 0, 0
         self._missing: tuple[Missing, ...] = ()
         if calibration is not None:
@@ -180,7 +180,12 @@ class IncrementalCalibrator:
     @property
     def history(self) -> tuple[HistoryRow, ...]:
         """The table at moments that grow rarer, and at every event."""
-        return tuple(self._history)
+        return tuple(
+            HistoryRow(
+                u.n_spots, u.rms_px, u.sigma0, u.parameters, tuple(e.words for e in u.events)
+            )
+            for u in self._history
+        )
 
     # --- spots ----------------------------------------------------------------------------------
 
@@ -340,7 +345,7 @@ class IncrementalCalibrator:
             prior=prior,
             prior_rows=rows,
             soft=soft_priors(cell, tied, held, self._priors),
-            noise=self._weighing(),
+            weighing=self._weighing(),
             scale=scale,
             robust=self._options.robust != "none",
         )
@@ -404,7 +409,7 @@ class IncrementalCalibrator:
             self._pending.append(number)
             filter.use(number, number + 1)
             return None
-        seen = Innovation.of(filter.expect(number), filter.scale)
+        seen = filter.expect(number)
         since = None if self._alarm is not None else self._look(filter, number, seen)
         if self._alarm is None and since is None:
             limit = rejection_length(filter.count + 1) if filter.robust else np.inf
@@ -430,9 +435,9 @@ class IncrementalCalibrator:
                 list(cell.cameras).index(camera),
                 list(cell.lasers).index(laser),
                 list(cell.planes).index(plane),
-                seen.by_camera,
-                seen.by_laser,
-                seen.by_plane,
+                seen.by_parts[:, :6],
+                seen.by_parts[:, 6:10],
+                seen.by_parts[:, 10:],
                 width * height / seen.area,
                 max(filter.dof, 1.0),
             )
@@ -617,7 +622,7 @@ class IncrementalCalibrator:
             prior=prior,
             prior_rows=old.prior_rows,
             soft=soft_priors(cell, tied, held, self._priors),
-            noise=old.noise,
+            weighing=old.weighing,
             start=start,
             open=still_open,
             end=old.end,
@@ -681,10 +686,7 @@ class IncrementalCalibrator:
         if estimate is not None and (events or self.n_spots >= self._next_row):
             grown = int(np.ceil(_HISTORY_GROWTH * self.n_spots))
             self._next_row = self.n_spots + 1 if self.n_spots < _EVERY_SPOT else grown
-            words = tuple(event.words for event in events)
-            self._history.append(
-                HistoryRow(self.n_spots, update.rms_px, update.sigma0, update.parameters, words)
-            )
+            self._history.append(update)
         return update
 
     def _used(self, estimate: Estimate) -> int:

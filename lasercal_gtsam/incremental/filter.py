@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +32,7 @@ from lasercal_gtsam.incremental.belief import (
     expansion,
     marginalised,
 )
+from lasercal_gtsam.incremental.innovation import Innovation
 from lasercal_gtsam.incremental.store import SpotStore
 from lasercal_gtsam.robust import rejection_length
 
@@ -80,15 +80,6 @@ class _Pass:
     linear: _Linear
     at: int
     marks: list[tuple[int, Marks]] = field(default_factory=list)
-
-
-class Expected(NamedTuple):
-    """How a spot compares with the estimate; see `stream_kernels.expect`."""
-
-    residual: Array
-    W: Array
-    C: Array
-    J: Array
 
 
 @dataclass(frozen=True)
@@ -190,7 +181,7 @@ class Filter:
     prior : (n+1, n+1) quadratic about the chart's origin, in a-priori sigmas: older spots, or a
         calibration; ``prior_rows``: how many residuals are behind its corner
     soft : priors that are not quadratic: coordinates to their augmented information, as ``prior``
-    noise : of the hand, and fading
+    weighing : noise of the hand, and fading
     start : where to begin (n,); the reference if left out
     scale : a-posteriori scale to begin with
     robust : whether outliers are left out
@@ -208,7 +199,7 @@ class Filter:
         prior: Array | None = None,
         prior_rows: float = 0.0,
         soft: Prior | None = None,
-        noise: Weighing | None = None,
+        weighing: Weighing | None = None,
         start: Array | None = None,
         scale: float = 1.0,
         robust: bool = True,
@@ -220,13 +211,13 @@ class Filter:
         n = self.chart.n
         self.held = held.copy()
         self.open = np.zeros(n, np.bool_) if open is None else open
-        self.noise = noise or Weighing(np.zeros(6), 1.0)
+        self.weighing = weighing or Weighing(np.zeros(6), 1.0)
         self.prior = np.zeros((n + 1, n + 1)) if prior is None else prior
         self.prior_rows = prior_rows
         self._soft = soft
         tied = np.flatnonzero(~np.isnan(self.chart.aspect_array))
         self._ties = (15 * tied + 6, 15 * tied + 7, self.chart.aspect_array[tied])
-        self._slice = SLICE_HAND if np.any(self.noise.hand > 0) else SLICE
+        self._slice = SLICE_HAND if np.any(self.weighing.hand > 0) else SLICE
         self._paths, self._offsets = np.empty((0, 3), np.int64), np.empty((0, 4), np.int64)
         self._pass: _Pass | None = None
         self._judged = 0
@@ -235,6 +226,9 @@ class Filter:
         self.scale = scale
         self.robust = robust
         self.fallbacks = 0
+        self._constraints = self._constrain()
+        self._about = self._about_from = np.empty((0, 0))
+        self._about_of: _Linear | None = None
         self._linear = self._at(np.zeros(n) if start is None else start)
         self._unknowns = self._count_unknowns()
         self._solve()
@@ -245,7 +239,7 @@ class Filter:
     def estimate(self) -> Estimate:
         """The state of things, to be kept."""
         cost = float(self._R[-1, -1] ** 2)
-        there = self._cost_there()
+        there = float(self._linear.H[-1, -1] + self._about[-1, -1])
         weight, square, _ = self._linear.sums
         square *= cost / there if there > 0 else 1.0
         return Estimate(
@@ -273,16 +267,16 @@ class Filter:
         """Distance (joint sigmas) of the estimate from its point of linearisation."""
         return float(np.linalg.norm(self._R[:-1, -1])) / self.scale
 
-    def expect(self, number: int) -> Expected:
+    def expect(self, number: int) -> Innovation:
         """How a stored spot compares with the estimate."""
         self._learn_paths()
-        _, (record, path, _) = next(iter(self.store.slices(number, number + 1)))
-        return Expected(
+        record, path = self.store.record(number)
+        where = (self._linear.view, self.now, self._R)
+        return Innovation(
             *stream_kernels.expect(
-                record[0], path[0], self._linear.view, self.now, self._R, self.noise,
-                *self._constraints,
+                record, path, *where, self.weighing, self.scale, *self._constraints
             )
-        )  # fmt: skip
+        )
 
     # --- spots ----------------------------------------------------------------------------------
 
@@ -290,8 +284,8 @@ class Filter:
         """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew."""
         self._learn_paths()
         self.end = end
-        if self.noise.fade < 1.0:
-            self._fade(self.noise.fade ** (end - begin))
+        if self.weighing.fade < 1.0:
+            self._fade(self.weighing.fade ** (end - begin))
         self._add(self._linear, begin, end)
         self._solve()
 
@@ -347,6 +341,7 @@ class Filter:
         free[columns] = True
         self.prior_rows -= float((free & ~held).sum())
         self.open[columns] = True
+        self._constraints = self._constrain()
         self._unknowns = self._count_unknowns()
         self._pass = None
         self._solve()
@@ -361,8 +356,8 @@ class Filter:
 
     # --- inside ---------------------------------------------------------------------------------
 
-    @property
-    def _constraints(self) -> tuple[Mask, Index, Index, Array]:
+    def _constrain(self) -> tuple[Mask, Index, Index, Array]:
+        """What `kernels.constrain` takes: constants, open coordinates and ties."""
         held = self.held | self.open
         held[self._ties[0]] = True
         return (held, *self._ties)
@@ -414,7 +409,7 @@ class Filter:
         for linear in [self._linear, *running]:
             linear.H = factor * linear.H
             linear.sums = factor * linear.sums
-        horizon = int(np.log(_FADED) / np.log(self.noise.fade))
+        horizon = int(np.log(_FADED) / np.log(self.weighing.fade))
         if self._pass is None and self.count > 2 * horizon:
             self.store.forget(self.end - horizon)
 
@@ -427,7 +422,7 @@ class Filter:
             marks = mark.copy() if judge else mark
             age = self.end - 1 - first
             H, sums = stream_kernels.accumulate(
-                records, path, marks, linear.view, self.noise, self.limit, judge, age
+                records, path, marks, linear.view, self.weighing, self.limit, judge, age
             )
             linear.H = linear.H + H
             linear.sums = linear.sums + sums
@@ -485,14 +480,14 @@ class Filter:
         prior = about_point(self.prior, linear.z)[-1, -1] + linear.soft[-1, -1]
         return float(linear.sums[2] + prior)
 
-    def _cost_there(self) -> float:
-        prior = about_point(self.prior, self._linear.z)[-1, -1] + self._linear.soft[-1, -1]
-        return float(self._linear.H[-1, -1] + prior)
-
     def _solve(self) -> None:
         linear = self._linear
-        prior = about_point(self.prior, linear.z) + linear.soft
-        self._R, self.z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
+        if linear is not self._about_of or self.prior is not self._about_from:
+            self._about = about_point(self.prior, linear.z) + linear.soft
+            self._about_of, self._about_from = linear, self.prior
+        self._R, self.z = stream_kernels.estimate(
+            linear.H, self._about, linear.z, *self._constraints
+        )
         self.now: State = self.chart.state(self.z)
         if self.dof >= 1:
             self.scale = max(float(self._R[-1, -1]) / float(np.sqrt(self.dof)), _MIN_SCALE)

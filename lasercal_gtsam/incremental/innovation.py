@@ -9,56 +9,37 @@ from typing import NamedTuple
 import numpy as np
 
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.incremental.filter import Expected
 from lasercal_gtsam.incremental.update import Innovations
 
 
 class Innovation(NamedTuple):
-    """One spot.
+    """One spot, as `lasercal_factors.stream_kernels.expect` sees it.
 
     Attributes
     ----------
     residual_px, covariance_px2 : (2,) predicted minus seen, and (2, 2) its covariance
-    chi2 : squared whitened length; infinite where no spot can be
-    e : (2,) whitened residual
-    by_camera, by_laser, by_plane : (2, 6), (2, 4), (2, 3) whitened derivatives by what may move:
-        rotation and translation in the camera frame; slopes and offsets; tilt and distance
-    area : of one standard deviation, ``sqrt(det covariance)``, px^2
+    e : (2,) whitened residual; NaN where no spot can be
+    by_parts : (2, 13) whitened derivatives by what may move: the camera's rotation and translation
+        in its own frame, the beam's slopes and offsets, the plane's tilt and distance
     """
 
     residual_px: Array
     covariance_px2: Array
-    chi2: float
     e: Array
-    by_camera: Array
-    by_laser: Array
-    by_plane: Array
-    area: float
+    by_parts: Array
 
-    @classmethod
-    def of(cls, expected: Expected, scale: float) -> Innovation:
-        """Whiten with the spot's noise (times ``scale``) and the estimate's own uncertainty."""
-        (r0, r1), (w00, w01, w11), C, J = expected
-        # C = L L^T
-        l00 = math.sqrt(C[0, 0])
-        l10 = C[1, 0] / l00
-        l11 = math.sqrt(max(C[1, 1] - l10 * l10, 1e-300))
-        white = np.array([[1.0 / l00, 0.0], [-l10 / (l00 * l11), 1.0 / l11]]) / scale
-        e = white @ np.array([w00 * r0 + w01 * r1, w11 * r1])
-        chi2 = float(e @ e)
-        unwhite = np.array([[1.0 / w00, -w01 / (w00 * w11)], [0.0, 1.0 / w11]])
-        by_plane = white @ J[:, 19:22]
-        by_plane[:, 2] *= -1.0  # the rows' offset is GTSAM's, -d
-        return cls(
-            expected.residual,
-            scale**2 * unwhite @ C @ unwhite.T,
-            chi2 if math.isfinite(chi2) else math.inf,
-            e,
-            white @ J[:, :6],
-            white @ J[:, 15:19],
-            by_plane,
-            scale**2 * l00 * l11 / (w00 * w11),
-        )
+    @property
+    def chi2(self) -> float:
+        """Squared whitened length; infinite where no spot can be."""
+        a, b = self.e.tolist()
+        chi2 = a * a + b * b
+        return chi2 if math.isfinite(chi2) else math.inf
+
+    @property
+    def area(self) -> float:
+        """Of one standard deviation, ``sqrt(det covariance)``, px^2."""
+        (a, b), (_, c) = self.covariance_px2.tolist()
+        return math.sqrt(a * c - b * b)
 
 
 def innovations_of(labels: Sequence[str], seen: Sequence[Innovation | None]) -> Innovations:

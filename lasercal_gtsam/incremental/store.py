@@ -78,6 +78,9 @@ class SpotStore:
 
     def mark(self, begin: int, end: int, mark: int) -> None:
         """Set what the estimate does with these spots."""
+        if end == begin + 1:
+            self._segments[begin // SEGMENT][2][begin % SEGMENT] = mark
+            return
         for _, (_, _, marks) in self.slices(begin, end):
             marks[:] = mark
 
@@ -90,6 +93,11 @@ class SpotStore:
         """Marks of the spots begin ... end-1 (all that are stored, if left out)."""
         parts = [s[2] for _, s in self.slices(self._from(begin), self._to(end))]
         return np.concatenate(parts) if parts else np.empty(0, np.uint8)
+
+    def record(self, number: int) -> tuple[Array, np.int32]:
+        """The row of a spot, and the number of its path."""
+        records, path, _ = self._segments[number // SEGMENT]
+        return records[number % SEGMENT], path[number % SEGMENT]
 
     def mark_of(self, number: int) -> int:
         """What the estimate does with a spot."""
