@@ -278,6 +278,6 @@ def _looks(spot: Look) -> Looks:
         one(spot.by_camera),
         one(spot.by_laser),
         one(spot.by_plane),
-        one(spot.area),
-        one(spot.dof),
+        np.array([spot.area], dtype=np.float64),
+        np.array([spot.dof], dtype=np.float64),
     )
