@@ -1,9 +1,8 @@
 """The convention doctor: which reading of a capture's numbers agrees with its spots.
 
 Every reading is solved without a start, as a calibration would be, and judged by the robust
-residual that is left. Most wrong readings are found out much earlier: within a group of pure
-translations the pixels must be a homography of the motion across the beam, and with the wrong
-rotations they are not (`closed_form.direction`); what is hopeless there is not solved.
+residual that is left. Most wrong readings are found out much earlier, at first sight (`screening`),
+and not solved.
 
 Nothing is switched: the doctor only says what it found.
 """
@@ -12,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from lasercal_gtsam.check.readings import (
     PixelReading,
     PoseReading,
 )
+from lasercal_gtsam.check.screening import misfit_px
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch
@@ -36,12 +36,13 @@ from lasercal_gtsam.robust import consensus, lengths_of, rejection_length
 from lasercal_gtsam.start import Search
 
 Progress = Callable[[int, int], None]
+_Result = TypeVar("_Result")
 
 _MOST_SPOTS = 300
-# a reading whose groups leave this many times what the best leaves is not solved, unless it is one
-# of the best few
+# a reading that leaves this many times what the best leaves at first sight is not solved, unless it
+# is one of the best few
 _HOPELESS = 10.0
-_KEPT_ANYWAY = 6
+_KEPT = 6
 # readings that mirrored pixels are tried on, and readings that are refined
 _MOST_MIRRORED = 3
 _MOST_REFINED = 6
@@ -75,39 +76,47 @@ def diagnose(
     rows = _evenly(observations)
     poses = [replace(pose, T_base_hand=pose.T_base_hand[rows]) for pose in poses]
     bench = _Bench.of(observations[rows], options)
-    misfits = np.array([bench.group_misfit_px(pose) for pose in poses])
-    hopeless = misfits > _HOPELESS * misfits.min()
-    hopeless[np.argsort(misfits, kind="stable")[:_KEPT_ANYWAY]] = False
-    hopeless[0] = False
-    kept = np.flatnonzero(~hopeless)
-    trials = [_Trial(poses[k], AS_DECLARED, misfits[k]) for k in kept]
-    trials.append(_Trial(poses[0], TURNED))
-    total = len(trials) + len(MIRRORED) * min(len(kept), _MOST_MIRRORED)
-    solved: list[_Solved] = []
-
-    def solve(trial: _Trial) -> None:
-        solved.append(bench.solve(trial))
-        if progress is not None:
-            progress(len(solved), total)
-
-    for trial in trials:
-        solve(trial)
-    # a mirrored picture passes the screening like a right one: look for it where that was passed
-    for found in [solved[0], *sorted(solved[1 : len(kept)], key=_Solved.rank)][:_MOST_MIRRORED]:
-        for pixels in MIRRORED:
-            solve(_Trial(found.trial.pose, pixels))
+    steps = _Steps(progress, len(poses))
+    misfits = np.array([steps.after(bench.misfit_px(_Trial(pose, AS_DECLARED))) for pose in poses])
+    mirrored = misfits
+    credible = CREDIBLE * bench.diagonal_px
+    if misfits.min() > credible:
+        steps.total += len(poses)
+        mirrored = np.array(
+            [steps.after(bench.misfit_px(_Trial(pose, MIRRORED[0]))) for pose in poses]
+        )
+    kept = _worth_solving(misfits, credible)
+    trials = [_Trial(poses[k], AS_DECLARED) for k in kept] + [_Trial(poses[0], TURNED)]
+    steps.total += len(trials) + len(MIRRORED) * min(len(poses), _MOST_MIRRORED)
+    solved = [steps.after(bench.solve(trial)) for trial in trials]
+    first = {k: found.residual_px for k, found in zip(kept, solved, strict=False)}
+    likely = sorted(range(len(poses)), key=lambda k: (k != 0, mirrored[k], first.get(k, np.inf)))
+    solved += [
+        steps.after(bench.solve(_Trial(poses[k], pixels)))
+        for k in likely[:_MOST_MIRRORED]
+        for pixels in MIRRORED
+    ]
     if all(s.trouble for s in solved):
         raise DegenerateError(solved[0].trouble)
     order = np.argsort([s.residual_px for s in solved], kind="stable")
-    refined = {0, len(kept), *(int(k) for k in order[:_MOST_REFINED])}
+    refined = {0, len(kept), *(int(k) for k in order[:_MOST_REFINED])}  # declared, and turned
     solved = [bench.refine(s) if k in refined else s for k, s in enumerate(solved)]
     limit_px = rejection_length(len(rows)) * min(s.residual_px for s in solved)
     judged = [s.judged(limit_px) for s in solved]
     judged += [
         Judged(poses[k].words, poses[k].change, float(misfits[k]), 0, "screened")
-        for k in np.flatnonzero(hopeless)
+        for k in range(len(poses))
+        if k not in kept
     ]
     return judge(judged, len(rows), bench.diagonal_px)
+
+
+def _worth_solving(misfits_px: Array, credible_px: float) -> list[int]:
+    """Readings to solve: the declared one (0) first, the best few, and all not hopeless."""
+    order = [int(k) for k in np.argsort(misfits_px, kind="stable")]
+    best = float(np.min(misfits_px[misfits_px > 0], initial=np.inf))  # 0: nothing can be said
+    limit = _HOPELESS * best if best <= credible_px else 0.0
+    return [0, *(k for i, k in enumerate(order) if k and (i < _KEPT or misfits_px[k] <= limit))]
 
 
 def _evenly(observations: Observations) -> Index:
@@ -122,13 +131,25 @@ def _evenly(observations: Observations) -> Index:
     return np.sort(np.concatenate(chosen))
 
 
+class _Steps:
+    """Counts what is done, for the progress bar."""
+
+    def __init__(self, show: Progress | None, total: int) -> None:
+        self.show, self.total, self.done = show, total, 0
+
+    def after(self, result: _Result) -> _Result:
+        self.done += 1
+        if self.show is not None:
+            self.show(self.done, self.total)
+        return result
+
+
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """A reading of poses and pixels, and what the pose reading's groups leave (px)."""
+    """A reading of poses and pixels."""
 
     pose: PoseReading
     pixels: PixelReading
-    misfit_px: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,10 +163,6 @@ class _Solved:
     lengths: Array
     stage: Stage = "closed form"
     trouble: str = ""
-
-    def rank(self) -> tuple[float, float]:
-        """Smaller is likelier to be the right reading of the poses."""
-        return self.trial.misfit_px, self.residual_px
 
     def judged(self, limit_px: float) -> Judged:
         """What remains of it; spots with a residual up to ``limit_px`` fit."""
@@ -182,32 +199,23 @@ class _Bench:
     def diagonal_px(self) -> float:
         return max(float(np.hypot(*size)) for size in self.observations.image_size.values())
 
-    def group_misfit_px(self, pose: PoseReading) -> float:
-        """Rms residual of the homographies of all groups; 0 where no group says anything."""
-        from lasercal_gtsam.closed_form.direction import robust_directions
-        from lasercal_gtsam.closed_form.groups import find_groups
-        from lasercal_gtsam.closed_form.spots import Spots, pairs_of
+    def read(self, trial: _Trial) -> Observations:
+        """The spots under a reading."""
+        uv = self.observations.uv.copy()
+        for camera in self.observations.cameras:
+            mine = self.observations.camera == camera
+            uv[mine] = trial.pixels.apply(uv[mine], self.observations.image_size[camera])
+        return replace(self.observations, uv=uv, T_base_hand=trial.pose.T_base_hand)
 
-        seen = replace(self.observations, T_base_hand=pose.T_base_hand)
-        worst = 0.0
-        for camera, laser in pairs_of(seen):
-            spots = Spots.of_pair(seen, camera, laser)
-            groups = find_groups(spots, self.hints["group_tolerance_rad"])
-            _, costs = robust_directions(groups)
-            if len(costs):
-                worst = max(worst, float(np.sqrt(0.5 * costs[0])) / float(spots.scaling[0, 0]))
-        return worst
+    def misfit_px(self, trial: _Trial) -> float:
+        """What the reading leaves at first sight."""
+        return misfit_px(self.read(trial), self.hints["group_tolerance_rad"])
 
     def solve(self, trial: _Trial) -> _Solved:
         """Closed form of a trial."""
         from lasercal_gtsam.closed_form import closed_form_candidates
 
-        seen = self.observations
-        uv = seen.uv.copy()
-        for camera in seen.cameras:
-            mine = seen.camera == camera
-            uv[mine] = trial.pixels.apply(uv[mine], seen.image_size[camera])
-        seen = replace(seen, uv=uv, T_base_hand=trial.pose.T_base_hand)
+        seen = self.read(trial)
         holds = resolve_holds(seen, self.options)
         search = Search(seen, make_batch(seen, None), holds, self.options)
         try:
