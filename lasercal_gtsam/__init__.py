@@ -20,12 +20,14 @@ _EXPORTS = {
     "DataError": "errors",
     "DegenerateError": "errors",
     "DetectionError": "errors",
+    "IncrementalCalibrator": "incremental",
     "Intrinsics": "cell",
     "LasercalError": "errors",
     "Observations": "observations",
     "Parameter": "calibration",
     "Plane": "cell",
     "SolveError": "errors",
+    "Update": "incremental",
     "calibrate": "api",
     "load_calibration": "io.calibration_file",
     "load_capture": "io.capture",
@@ -44,12 +46,14 @@ __all__ = [
     "DataError",
     "DegenerateError",
     "DetectionError",
+    "IncrementalCalibrator",
     "Intrinsics",
     "LasercalError",
     "Observations",
     "Parameter",
     "Plane",
     "SolveError",
+    "Update",
     "__version__",
     "calibrate",
     "load_calibration",
@@ -71,6 +75,7 @@ if TYPE_CHECKING:
         LasercalError,
         SolveError,
     )
+    from lasercal_gtsam.incremental import IncrementalCalibrator, Update
     from lasercal_gtsam.io.calibration_file import load_calibration
     from lasercal_gtsam.io.capture import load_capture
     from lasercal_gtsam.observations import Observations

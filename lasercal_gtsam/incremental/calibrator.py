@@ -463,7 +463,6 @@ class IncrementalCalibrator:
         filter.take_out(self._since, filter.end, HELD_BACK)
         label, number = self._store.label(self._since), self._older + self._since
         self._alarm = Alarm(label, number, 0, (), "")
-        self._note("alarm", f"something has changed since spot {label}")
 
     def _examine(self) -> None:
         """Which cause explains the spots since the alarm best; act where that is sure."""
@@ -488,6 +487,8 @@ class IncrementalCalibrator:
         )
         words = f"since spot {alarm.since}: {found.words}"
         self._alarm = replace(alarm, spots=count, causes=found.causes, words=words)
+        if not alarm.causes:
+            self._note("alarm", words)
         cause = found.causes[0]
         if cause.probability < _SURE or count < _FEWEST:
             return
@@ -534,6 +535,7 @@ class IncrementalCalibrator:
         self._pending = sorted({*self._pending, *range(onset, self._store.end)})
         self._alarm = None
         self._detector.reset()
+        self._use_ready()
         named = " and ".join(f"{kind} {name!r}" for kind, name in parts)
         self._note("reset", f"{named} freed{': ' + why if why else ''}")
 
@@ -581,12 +583,18 @@ class IncrementalCalibrator:
         self._filter = self._relaid(old, cell, kind, name)
         counts = len(cell.cameras), len(cell.lasers), len(cell.planes)
         self._detector.cover(*counts)
-        known = self._known(self._store.chosen(self._pending), cell)
-        ready = [n for n, good in zip(self._pending, known, strict=True) if good]
-        self._pending = sorted(set(self._pending) - set(ready))
-        self._mark_used(ready)
+        self._use_ready()
         verb = "found" if is_new else "found again"
         self._note("extended" if is_new else "recovered", f"{kind} {name!r} {verb}")
+
+    def _use_ready(self) -> None:
+        """Use the spots that wait for nothing any more."""
+        if self._pending:
+            cell = self._running().template
+            known = self._known(self._store.chosen(self._pending), cell)
+            ready = [n for n, good in zip(self._pending, known, strict=True) if good]
+            self._pending = sorted(set(self._pending) - set(ready))
+            self._mark_used(ready)
 
     def _relaid(self, old: Filter, cell: Cell, kind: Part, name: str) -> Filter:
         """The same knowledge in the chart of a cell with a part more, or elsewhere."""

@@ -269,9 +269,8 @@ class Filter:
 
     def expect(self, number: int) -> Innovation:
         """How a stored spot compares with the estimate."""
-        self._learn_paths()
         record, path = self.store.record(number)
-        where = (self._linear.view, self.now, self._R)
+        where = (self._view(self._linear), self.now, self._R)
         return Innovation(
             *stream_kernels.expect(
                 record, path, *where, self.weighing, self.scale, *self._constraints
@@ -282,7 +281,6 @@ class Filter:
 
     def use(self, begin: int, end: int) -> None:
         """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew."""
-        self._learn_paths()
         self.end = end
         if self.weighing.fade < 1.0:
             self._fade(self.weighing.fade ** (end - begin))
@@ -295,27 +293,28 @@ class Filter:
             self.relinearise(_SETTLED)
             return
         if self._pass is None and (self.moved > _MOVED or self._grown()):
-            self._pass = self._new_pass()
+            self._pass = self._new_pass(self.z)
         if self._pass is not None:
             self._advance(self._pass)
             if self._pass.at >= self.end:
                 self._take_over(self._pass)
 
-    def relinearise(self, settled: float = 0.0) -> None:
-        """Gauss-Newton over all spots until the estimate has settled (sigmas); cost linear."""
+    def relinearise(self, settled: float | None = None) -> None:
+        """Gauss-Newton over all spots until the estimate has settled (sigmas); cost linear.
+
+        Without a limit once at least, whatever it was before: the marks have been changed.
+        """
         self._pass = None
-        for k in range(_ROUNDS):
-            if (k or settled) and self.moved <= (settled or _SETTLED) and not self._grown():
+        if settled is None:
+            self._accept(self._whole_pass(self.z))
+        for _ in range(_ROUNDS):
+            if self.moved <= (settled or _SETTLED) and not self._grown():
                 return
-            self._pass = self._new_pass()
-            while self._pass.at < self.end:
-                self._advance(self._pass)
-            if not self._take_over(self._pass):
+            if not self._take_over(self._whole_pass(self.z)):
                 return
 
     def take_out(self, begin: int, end: int, mark: int) -> None:
         """Take the spots begin ... end-1 out of the estimate and mark them."""
-        self._learn_paths()
         self._subtract(begin, end)
         self.store.mark(begin, end, mark)
         self._pass = None
@@ -381,9 +380,13 @@ class Filter:
             pose, laser_at = CAMERA_DIM * c, first_laser + BEAM_DIM * l
             offsets.append((pose, pose + POSE, laser_at, first_plane + PLANE_DIM * p))
         self._paths, self._offsets = np.array(index, np.int64), np.array(offsets, np.int64)
-        running = [self._pass.linear] if self._pass else []
-        for linear in [self._linear, *running]:
+
+    def _view(self, linear: _Linear) -> View:
+        """Where it is linearised, with all the paths there are by now."""
+        self._learn_paths()
+        if len(linear.view.paths) != len(self._paths):
             linear.view = linear.view._replace(paths=self._paths, offsets=self._offsets)
+        return linear.view
 
     def _at(self, z: Array) -> _Linear:
         """No spots yet, linearised at ``z``."""
@@ -398,9 +401,15 @@ class Filter:
     def _grown(self) -> bool:
         return self.count > _GROWN * self._judged
 
-    def _new_pass(self) -> _Pass:
+    def _new_pass(self, z: Array) -> _Pass:
         self._judged = self.count
-        return _Pass(self._at(self.z), self.store.first)
+        return _Pass(self._at(z), self.store.first)
+
+    def _whole_pass(self, z: Array) -> _Pass:
+        done = self._new_pass(z)
+        while done.at < self.end:
+            self._advance(done)
+        return done
 
     def _fade(self, factor: float) -> None:
         self.prior = factor * self.prior
@@ -417,12 +426,12 @@ class Filter:
         self, linear: _Linear, begin: int, end: int, judge: bool = False
     ) -> list[tuple[int, Marks]]:
         """Add spots to a linearisation; where they are judged anew, their marks, not yet set."""
-        found = []
+        view, found = self._view(linear), []
         for first, (records, path, mark) in self.store.slices(begin, end):
             marks = mark.copy() if judge else mark
             age = self.end - 1 - first
             H, sums = stream_kernels.accumulate(
-                records, path, marks, linear.view, self.weighing, self.limit, judge, age
+                records, path, marks, view, self.weighing, self.limit, judge, age
             )
             linear.H = linear.H + H
             linear.sums = linear.sums + sums
@@ -462,9 +471,7 @@ class Filter:
             extra[range(n), range(n)] = damping * np.diag(linear.H)[:n]
             prior = about_point(self.prior, linear.z) + linear.soft + extra
             _, z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
-            trial = _Pass(self._at(z), self.store.first)
-            while trial.at < self.end:
-                self._advance(trial)
+            trial = self._whole_pass(z)
             found = self._loss(trial.linear)
             if found < loss:
                 loss, damping = found, damping / 10.0
