@@ -42,10 +42,10 @@ _MOST_SPOTS = 300
 # a reading that leaves this many times what the best leaves at first sight is not solved, unless it
 # is one of the best few
 _HOPELESS = 10.0
-_KEPT = 6
+_KEPT = 4
 # readings that mirrored pixels are tried on, and readings that are refined
-_MOST_MIRRORED = 3
-_MOST_REFINED = 6
+_MOST_MIRRORED = 2
+_MOST_REFINED = 5
 _STARTS = 3
 # share of a credible residual at which no further start is tried
 _CLEAR = 0.25
@@ -77,14 +77,12 @@ def diagnose(
     poses = [replace(pose, T_base_hand=pose.T_base_hand[rows]) for pose in poses]
     bench = _Bench.of(observations[rows], options)
     steps = _Steps(progress, len(poses))
-    misfits = np.array([steps.after(bench.misfit_px(_Trial(pose, AS_DECLARED))) for pose in poses])
+    misfits = bench.misfits_px(poses, AS_DECLARED, steps)
     mirrored = misfits
     credible = CREDIBLE * bench.diagonal_px
     if misfits.min() > credible:
         steps.total += len(poses)
-        mirrored = np.array(
-            [steps.after(bench.misfit_px(_Trial(pose, MIRRORED[0]))) for pose in poses]
-        )
+        mirrored = bench.misfits_px(poses, MIRRORED[0], steps)
     kept = _worth_solving(misfits, credible)
     trials = [_Trial(poses[k], AS_DECLARED) for k in kept] + [_Trial(poses[0], TURNED)]
     steps.total += len(trials) + len(MIRRORED) * min(len(poses), _MOST_MIRRORED)
@@ -207,9 +205,19 @@ class _Bench:
             uv[mine] = trial.pixels.apply(uv[mine], self.observations.image_size[camera])
         return replace(self.observations, uv=uv, T_base_hand=trial.pose.T_base_hand)
 
-    def misfit_px(self, trial: _Trial) -> float:
-        """What the reading leaves at first sight."""
-        return misfit_px(self.read(trial), self.hints["group_tolerance_rad"])
+    def misfits_px(
+        self, poses: Sequence[PoseReading], pixels: PixelReading, steps: _Steps
+    ) -> Array:
+        """What each reading leaves at first sight; hopeless ones are not followed to the end."""
+        found: list[float] = []
+        give_up = np.inf
+        for pose in poses:
+            seen = self.read(_Trial(pose, pixels))
+            px = misfit_px(seen, self.hints["group_tolerance_rad"], give_up)
+            found.append(steps.after(px))
+            if px > 0:
+                give_up = min(give_up, _HOPELESS * px)
+        return np.array(found)
 
     def solve(self, trial: _Trial) -> _Solved:
         """Closed form of a trial."""

@@ -243,3 +243,24 @@ MIRRORED = (
     ),
 )
 """The usual mistakes about pixels; each is a mirror image, up to a turn of the camera."""
+
+
+def swapped_pixels(head: CaptureHead, folder: Path) -> list[str]:
+    """A sentence if spots lie outside the picture, but none with u and v exchanged."""
+    names = [head.poses.file, *([head.spots.file] if head.spots else [])]
+    width, height = (
+        min(getattr(camera, side) for camera in head.camera) for side in ("width", "height")
+    )
+    for name in names:
+        table = read_table(folder / name, name)
+        if not {"u", "v"} <= set(table.columns):
+            continue
+        uv = table.numbers(["u", "v"], allow_empty=True)
+        uv = uv[np.isfinite(uv).all(axis=1)]
+        outside = (uv > np.array([width, height])).any()
+        if len(uv) and outside and (uv[:, ::-1] <= np.array([width, height])).all():
+            return [
+                f"{name}: with u and v exchanged all spots lie inside the picture: exchange the "
+                "columns u and v"
+            ]
+    return []

@@ -21,7 +21,7 @@ from lasercal_gtsam.projection import project, spot_on_beam, spot_on_ray
 from lasercal_gtsam.rotations import basis_of, rotation_exp
 from lasercal_gtsam.units import RAD_PER_DEG
 
-Kind = Literal["turn", "plane", "spread", "repeat"]
+Kind = Literal["turn", "plane", "spread"]
 
 SHOTS = 20
 """Shots that a remedy adds."""
@@ -59,9 +59,6 @@ def remedies(cell: Cell, observations: Observations) -> Iterator[Remedy]:
         for azimuth in (0.0, 90.0, 180.0, 270.0):
             wider, shots = _on_new_plane(cell, few, degrees, azimuth)
             yield from _kept("plane", _plane_words(cell, degrees), wider, shots)
-    yield Remedy(
-        "repeat", f"add {len(observations)} shots like those there are", cell, observations
-    )
 
 
 _SPREAD = (

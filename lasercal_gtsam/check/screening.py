@@ -21,11 +21,16 @@ from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.observations import Observations
 
+_DIRECTIONS = 2
 
-def misfit_px(observations: Observations, group_tolerance_rad: float) -> float:
+
+def misfit_px(
+    observations: Observations, group_tolerance_rad: float, give_up_px: float = np.inf
+) -> float:
     """Residual (px) that a reading leaves at first sight, of the worst camera and laser.
 
     0 where the shots form no groups that say anything of the beam; infinite where no cell came out.
+    From ``give_up_px`` on nobody wants to know it more exactly.
     """
     worst = 0.0
     for camera, laser in pairs_of(observations):
@@ -34,7 +39,9 @@ def misfit_px(observations: Observations, group_tolerance_rad: float) -> float:
         if not len(costs):
             continue
         of_groups = float(np.sqrt(0.5 * costs[0])) / float(spots.scaling[0, 0])
-        worst = max(worst, of_groups, _of_cells(spots, directions))
+        worst = max(worst, of_groups)
+        if worst < give_up_px:
+            worst = max(worst, _of_cells(spots, directions[:_DIRECTIONS]))
     return worst
 
 

@@ -201,6 +201,11 @@ class _Bench:
                 )
                 for remedy, bench in tried
             ]
+            # as many shots again double the information
+            again = f"add {len(self.observations)} shots like those there are"
+            cures.append(
+                Cure("repeat", causes["repeat"].words, again, np.sqrt(2.0) * direction.strength)
+            )
             found.append(
                 Weakness(
                     direction.strength,

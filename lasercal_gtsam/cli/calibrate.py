@@ -11,7 +11,7 @@ from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
 from lasercal_gtsam.cli.outputs import check_calibration_target
 from lasercal_gtsam.cli.texts import account_lines, count, looked_at, result_lines
 from lasercal_gtsam.cli.values import Assignment, Distortion, Number
-from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.errors import DataError, DegenerateError, SolveError
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
@@ -116,7 +116,11 @@ def calibrate(
 
     from lasercal_gtsam.api import calibrate as solve
 
-    result = solve(observations, initial=start, options=options)
+    hint = f"'lasercal check {capture}' looks for the cause"
+    try:
+        result = solve(observations, initial=start, options=options)
+    except (DegenerateError, SolveError) as error:
+        raise type(error)(f"{error}; {hint}") from error
     saved, failure = None, None
     if result.fit.converged or keep_unconverged:
         try:
@@ -132,11 +136,23 @@ def calibrate(
             click.echo(f"Saved {saved}.")
     if failure is not None:
         raise failure
+    if _fits_badly(result):
+        click.echo(
+            f"Warning: the residuals are as large as if something were wrong; {hint}", err=True
+        )
     if result.fit.converged:
         return 0
     outcome = "saved all the same" if saved else "nothing was saved (see --keep-unconverged)"
-    click.echo(f"Error: {result.fit.status}; {outcome}", err=True)
+    click.echo(f"Error: {result.fit.status}; {outcome}; {hint}", err=True)
     return 1
+
+
+def _fits_badly(result: Calibration) -> bool:
+    """Residuals of more than 1 % of the image diagonal: no detector is as bad as that."""
+    import numpy as np
+
+    diagonal = max(np.hypot(*size) for size in result.inputs.observations.image_size.values())
+    return bool(result.fit.rms_px > 0.01 * diagonal)
 
 
 def save(result: Calibration, path: Path, capture: Capture) -> None:

@@ -16,6 +16,7 @@ import click
 
 from lasercal_gtsam import __version__
 from lasercal_gtsam.cli.calibrate import calibrate
+from lasercal_gtsam.cli.check import check
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
 from lasercal_gtsam.cli.simulate import simulate
@@ -40,7 +41,7 @@ def cli() -> None:
     """
 
 
-for _command in (calibrate, detect, simulate, demo):
+for _command in (calibrate, check, detect, simulate, demo):
     cli.add_command(_command)
 
 
