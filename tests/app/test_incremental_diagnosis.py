@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from core_cases import differences, simulated
 from incremental_cases import bumped, outliers_among, spots_in_turn, with_sigma
+from test_core_cameras import capture, two_eyed_cell
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.hand_noise import HandNoise
@@ -312,3 +313,19 @@ def test_what_cannot_be_diagnosed_is_refused() -> None:
     # what the spots do not touch need not be known
     rest = seen[seen.plane != "1"]
     assert diagnose(vague, rest, rest.cov_uv, outlier_rate=0.01).causes[0].kind == "camera"
+
+
+def test_of_two_cameras_and_two_lasers_the_one_that_moved_is_named() -> None:
+    cell = two_eyed_cell()
+    pairs = [("left", "blue"), ("right", "blue"), ("left", "red"), ("right", "red")]
+    seen = with_sigma(capture(cell, pairs, Noise(pixel_px=PX)), PX)
+    known = Belief.of(lc.calibrate(seen, initial=cell))
+    for kind, name in (("camera", "right"), ("laser", "red"), ("plane", "3")):
+        new = bumped(cell, kind, name, 2.0, 10.0, np.random.default_rng(3))
+        spots = with_sigma(capture(new, pairs, Noise(pixel_px=PX)), PX)[::7]
+        found = diagnose(known, spots, spots.cov_uv, outlier_rate=0.01)
+        assert len(found.causes) == 2 + 2 + 3 + 2
+        cause = found.causes[0]
+        assert (cause.kind, cause.name) == (kind, name)
+        assert cause.probability > 0.999
+        assert abs(cause.turn_deg - 2.0) < 4 * cause.sigma_deg < 4.0
