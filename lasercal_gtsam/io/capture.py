@@ -174,7 +174,7 @@ class Capture(FrozenData):
         ``overrides`` are fields of `CalibrationOptions` and win over the capture; ``known`` is
         merged name by name.
         """
-        return stated_options(self.noise, self.known, **overrides)
+        return stated_options(self.noise, self.known, overrides)
 
     def _default_detector(self) -> Detector:
         from lasercal_gtsam.detect.options import DetectionOptions
@@ -286,7 +286,7 @@ def load_capture(path: str | Path) -> Capture:
 
 
 def stated_options(
-    noise: CaptureNoise, known: Mapping[str, Any], **overrides: Any
+    noise: CaptureNoise, known: Mapping[str, Any], overrides: Mapping[str, Any] | None = None
 ) -> CalibrationOptions:
     """Options with stated noise and known values; see `Capture.options`."""
     stated = {
@@ -294,8 +294,9 @@ def stated_options(
         "hand_sigma_m": noise.hand_sigma_m,
         "hand_sigma_rad": noise.hand_sigma_rad,
     }
-    merged = {**known, **overrides.pop("known", {})}
-    return CalibrationOptions(**{**stated, **overrides, "known": merged})
+    chosen = dict(overrides or {})
+    merged = {**known, **chosen.pop("known", {})}
+    return CalibrationOptions(**{**stated, **chosen, "known": merged})
 
 
 def capture_file(path: Path) -> Path:
