@@ -19,7 +19,10 @@ from lasercal_gtsam.cli.calibrate import calibrate
 from lasercal_gtsam.cli.check import check
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
+from lasercal_gtsam.cli.history import history
 from lasercal_gtsam.cli.simulate import simulate
+from lasercal_gtsam.cli.update import update
+from lasercal_gtsam.cli.watch import watch
 from lasercal_gtsam.errors import LasercalError
 
 FAILED, INTERRUPTED = 1, 130
@@ -41,7 +44,7 @@ def cli() -> None:
     """
 
 
-for _command in (calibrate, check, detect, simulate, demo):
+for _command in (calibrate, check, detect, update, watch, history, simulate, demo):
     cli.add_command(_command)
 
 

@@ -77,6 +77,18 @@ def parameter_names(rows: Iterable[HistoryRow]) -> list[Name]:
     return order
 
 
+def earlier_rows(path: Path, spots: int) -> tuple[HistoryRow, ...]:
+    """Rows of a history file before a number of spots; none where there is no file.
+
+    Raises
+    ------
+    DataError
+        As in `read_history`.
+    """
+    rows = read_history(path) if path.exists() else ()
+    return tuple(row for row in rows if row.spots < spots)
+
+
 def read_history(path: str | Path) -> tuple[HistoryRow, ...]:
     """Read a history; ``initial`` of its parameters, which is not in the file, is NaN.
 

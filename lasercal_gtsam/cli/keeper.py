@@ -1,0 +1,219 @@
+"""Keeps what a running calibration gives: result and history on the disk, words on the screen."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lasercal_gtsam.cli.live import Screen, alarm_words, sigma_words, spot_document, state_words
+from lasercal_gtsam.cli.texts import count
+from lasercal_gtsam.errors import DataError, LasercalError
+from lasercal_gtsam.io.calibration_file import save_calibration
+from lasercal_gtsam.io.history_file import history_path, write_history
+from lasercal_gtsam.io.plain import plain
+
+if TYPE_CHECKING:
+    from lasercal_gtsam.history import HistoryRow
+    from lasercal_gtsam.incremental.journaled import JournaledCalibrator
+    from lasercal_gtsam.incremental.update import Update
+    from lasercal_gtsam.io.follow import Notice
+    from lasercal_gtsam.observations import Observations
+
+# The result holds every spot: it is written no more often than this, and takes no more than a
+# twentieth of the time.
+_SAVE_S, _SAVE_SHARE = 5.0, 20.0
+_HEARTBEATS, _HEARTBEAT = (1, 10, 100), 1000
+_RED = "red"
+
+_HOW = {
+    False: "To free it, end this and start it again with --reset {part}:{name}; if nothing has "
+    "moved, with --dismiss.",
+    True: 'To free it, send {{"reset": {{"{part}": "{name}"}}}}; if nothing has moved, '
+    '{{"dismiss": true}}.',
+}
+
+
+class Keeper:
+    """Takes spots into a session, says what happens, and saves.
+
+    Parameters
+    ----------
+    session : the running calibration with its journal
+    target : where the result goes
+    screen : where words go
+    sources : file name to SHA-256, kept in the result
+    earlier : the history before this session's
+    conversation : whether the user sends lines, which get the answers, and can send a reset
+    as_json : whether every spot gets a line of JSON otherwise
+    """
+
+    def __init__(
+        self,
+        session: JournaledCalibrator,
+        target: Path,
+        screen: Screen,
+        *,
+        sources: Mapping[str, str],
+        earlier: Sequence[HistoryRow] = (),
+        conversation: bool = False,
+        as_json: bool = False,
+    ) -> None:
+        self.session, self.screen = session, screen
+        self._target, self._sources = target, dict(sources)
+        self._earlier = tuple(earlier)
+        self._conversation, self._as_json = conversation, as_json
+        self._began = session.calibrator.n_spots
+        self._alarm: tuple[Any, ...] | None = None
+        self._dirty = session.replayed > 0
+        self._saved = time.monotonic()
+        self._cost = 0.0
+        self._said_unsaved = False
+
+    def take(self, spots: Sequence[Observations]) -> None:
+        """Journal spots, then take one after the other, saying what happens.
+
+        Raises
+        ------
+        DataError
+            They could not be written, and do not count.
+        """
+        for spot, answer in zip(spots, self.session.add(spots), strict=True):
+            name = str(spot.id[0])
+            if isinstance(answer, LasercalError):
+                if self._conversation or self._as_json:
+                    self.print({"id": name, "error": str(answer)})
+                self.screen.warn(f"Warning: id {name}: {answer}")
+                continue
+            if self._conversation or self._as_json:
+                self.print(spot_document(name, answer))
+            self.said(answer)
+            self.save_if_due()
+
+    def said(self, update: Update) -> None:
+        """Say what happened in an update, and remember to save it."""
+        self._dirty = True
+        for event in update.events:
+            if event.kind != "alarm":
+                self.screen.line(f"{count(event.spots, 'spot')}: {event.kind}: {event.words}")
+        self._say_alarm(update)
+        if self.screen.live:
+            for rejection in update.rejected:
+                self.screen.line(f"id {rejection.id} rejected: {rejection.reason}")
+        elif not (self._as_json or self._conversation):
+            n = update.n_spots
+            if n in _HEARTBEATS or n % _HEARTBEAT == 0:
+                self.screen.line(state_words(update))
+        self._show(update)
+        if update.events:
+            self.save(now=True)
+
+    def _say_alarm(self, update: Update) -> None:
+        alarm = update.alarm
+        if alarm is None:
+            self._alarm = None
+            return
+        cause = (alarm.cause.kind, alarm.cause.name) if alarm.causes else ()
+        if self._alarm == (alarm.since, *cause):
+            return
+        self._alarm = (alarm.since, *cause)
+        self._dirty = True
+        words = alarm_words(alarm, _HOW[self._conversation])
+        self.screen.line(click.style(f"Alarm: {words}", fg=_RED))
+
+    def _show(self, update: Update) -> None:
+        if not self.screen.live:
+            return
+        if update.phase == "collecting":
+            self.screen.status(state_words(update))
+            return
+        text = (
+            f"{update.n_spots} spots, {update.n_used} used, RMS {update.rms_px:.3g} px, "
+            f"{sigma_words(update.parameters)}"
+        )
+        if update.alarm is not None:
+            text += click.style(", ALARM", fg=_RED, bold=True)
+        elif update.missing:
+            text += f", {update.missing[0].words}"
+        self.screen.status(text)
+
+    def notice(self, notice: Notice) -> None:
+        """Say what the follower has to say."""
+        if self._as_json:
+            self.print({"notice": notice.kind, "id": notice.id, "words": notice.words})
+        elif notice.kind == "note":
+            self.screen.line(notice.words)
+        else:
+            self.screen.warn(f"Warning: {notice.words}")
+
+    def idle(self, waiting: Mapping[str, str]) -> None:
+        """Let the live line say what is waited for, where nothing else has been said yet."""
+        if self.screen.live and self.session.calibrator.n_spots == self._began and waiting:
+            name, why = next(iter(waiting.items()))
+            self.screen.status(f"waiting: {name}: {why}")
+
+    def print(self, document: Mapping[str, Any]) -> None:
+        """One line of JSON on stdout, at once."""
+        click.echo(json.dumps(plain(document), ensure_ascii=False, allow_nan=False))
+        sys.stdout.flush()
+
+    def save_if_due(self) -> None:
+        """Save, unless that was done a moment ago."""
+        self.save(now=False)
+
+    def save(self, now: bool) -> None:
+        """Write result and history; a full disk is said once, and tried again."""
+        since = time.monotonic() - self._saved
+        if not self._dirty or not (now or since > max(_SAVE_S, _SAVE_SHARE * self._cost)):
+            return
+        if now and since < self._cost:
+            return  # soon enough
+        try:
+            self._write()
+        except DataError as error:
+            if not self._said_unsaved:
+                self.screen.warn(f"Warning: {error}; the journal has everything")
+            self._said_unsaved = True
+            self._saved = time.monotonic()
+
+    def _write(self) -> None:
+        began = time.monotonic()
+        calibrator = self.session.calibrator
+        result = calibrator.calibration
+        if result is not None:
+            save_calibration(result, self._target, sources=self._sources)
+            write_history(history_path(self._target), [*self._earlier, *calibrator.history])
+        self._dirty, self._said_unsaved = False, False
+        self._saved = time.monotonic()
+        self._cost = self._saved - began
+
+    def finish(self, waiting: Mapping[str, str]) -> None:
+        """Save, and say what was done.
+
+        Raises
+        ------
+        DataError
+            The result cannot be written.
+        """
+        self.screen.close()
+        calibrator = self.session.calibrator
+        if self._dirty:
+            self._write()
+        taken = calibrator.n_spots - self._began
+        words = [f"{count(taken, 'spot')} taken, {calibrator.n_spots} in all"]
+        if calibrator.calibration is None:
+            words += [missing.words for missing in calibrator.missing] or ["no estimate yet"]
+        elif calibrator.alarm is not None:
+            words.append(f"ALARM open: {calibrator.alarm.words}")
+        if waiting:
+            name, why = next(iter(waiting.items()))
+            more = f" (and {len(waiting) - 1} more)" if len(waiting) > 1 else ""
+            words.append(f"waiting: {name}: {why}{more}")
+        self.screen.line(f"Ended: {'; '.join(words)}.")
+        if calibrator.calibration is not None:
+            self.screen.line(f"Saved {self._target}.")
