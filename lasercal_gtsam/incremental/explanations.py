@@ -7,12 +7,11 @@ things have moved if it is right.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from lasercal_gtsam.cell import Cell
-from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.hand_noise import HandNoise
 from lasercal_gtsam.incremental.belief import Part, coordinates
@@ -23,7 +22,7 @@ from lasercal_gtsam.incremental.change import (
     middle_of_spots,
 )
 from lasercal_gtsam.incremental.evidence import Mode, Scene
-from lasercal_gtsam.incremental.relocate import camera_candidates, locate_laser, locate_plane
+from lasercal_gtsam.incremental.recover import relocated
 from lasercal_gtsam.incremental.update import CauseKind
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.units import M_PER_MM, RAD_PER_DEG
@@ -135,7 +134,8 @@ class Move:
         mode = scene.mode(S, SCALES[-1] * D, trusting=True)
         mine = getattr(observations, kind) == name
         if mode.good[mine].mean() < _EXPLAINED:
-            for z in _relocated(cell, observations[mine], S[mine], kind, name):
+            for other_cell in relocated(cell, observations[mine], S[mine], kind, name):
+                z = coordinates(cell, other_cell)
                 b = np.linalg.solve(basis * unit, z[columns]) / SCALES[-1]
                 y = np.concatenate([np.zeros(scene.known.shape[1]), b])
                 other = scene.mode(S, SCALES[-1] * D, y)
@@ -192,26 +192,6 @@ class Move:
     def _after(self, scene: Scene, mode: Mode, scale: float) -> Cell:
         k = scene.known.shape[1]
         return scene.cell(scene.known @ mode.y[:k] + scale * self.D @ mode.y[k:])
-
-
-def _relocated(
-    cell: Cell, observations: Observations, S: Array, kind: Part, name: str
-) -> list[Array]:
-    """Chart coordinates of the cell with the part located anew; none where that fails."""
-    seen = replace(observations, cov_uv=S)
-    try:
-        if kind == "camera":
-            found = [
-                replace(cell, cameras={**cell.cameras, name: camera})
-                for camera in camera_candidates(cell, seen)
-            ]
-        elif kind == "laser":
-            found = [replace(cell, lasers={**cell.lasers, name: locate_laser(cell, seen)})]
-        else:
-            found = [cell.with_planes({**cell.planes, name: locate_plane(cell, seen)})]
-        return [coordinates(cell, moved) for moved in found]
-    except LasercalError:
-        return []
 
 
 def _averaged(modes: Sequence[Mode], sizes: int) -> tuple[float, Array]:

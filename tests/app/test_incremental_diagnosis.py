@@ -13,9 +13,10 @@ from test_core_cameras import capture, two_eyed_cell
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.hand_noise import HandNoise
-from lasercal_gtsam.incremental.belief import Belief, coordinates, fuse
+from lasercal_gtsam.incremental.belief import Belief, coordinates
 from lasercal_gtsam.incremental.diagnosis import PRIOR_ODDS, Diagnosis, diagnose
 from lasercal_gtsam.incremental.evidence import Scene
+from lasercal_gtsam.incremental.recover import recover
 from lasercal_gtsam.rotations import basis_of
 from lasercal_gtsam.simulate import Noise
 
@@ -255,15 +256,34 @@ def test_likelihoods_are_relative_to_outliers_and_give_the_probabilities() -> No
 def test_the_part_set_free_is_given_back(kind: str) -> None:
     truth, _ = calibrated()
     new, seen = after(kind, (20.0, 100.0), 20)
-    found = diagnosed(seen[:10])
     columns = belief().columns(kind, NAMES[kind])
-    fused = fuse(belief().without(columns), seen, seen.cov_uv, start=found.cell)
+    fused = recover(belief(), kind, NAMES[kind], seen, seen.cov_uv, start=diagnosed(seen[:10]).cell)
     assert not fused.troubles
     covariance = fused.belief.covariance[columns, columns]
     error = coordinates(fused.cell, new)[columns]
     assert float(error @ np.linalg.solve(covariance, error)) < 25.0
     # and it is not where it was
     assert float(np.abs(coordinates(fused.cell, truth)[columns]).max()) > 0.05
+
+
+def test_a_start_from_which_the_optimiser_cannot_move_is_no_trap() -> None:
+    # the plane so steep that the next step leaves a beam without a hit
+    new, seen = after("plane", (20.0, 100.0), 20)
+    known = belief()
+    steep = new.planes["2"].normal_base + 0.5 * basis_of(new.planes["2"].normal_base)[:, 0]
+    mean = lc.spot_on_beam(new, seen.T_base_hand, plane=seen.plane.tolist())
+    plane = lc.Plane.from_point(steep, mean[seen.plane == "2"].mean(axis=0))
+    start = new.with_planes({**new.planes, "2": plane})
+    fused = recover(known, "plane", "2", seen, seen.cov_uv, start=start)
+    assert fused.spot_cost < 4 * len(seen)
+    assert float(np.abs(residuals(fused.cell, seen)).max()) < 6 * PX
+
+
+def test_recovering_fails_in_words() -> None:
+    _, seen = after("camera", (2.0, 10.0))
+    behind = replace(seen, T_base_hand=seen.T_base_hand @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    with pytest.raises(lc.SolveError, match="plane '2' cannot be given back"):
+        recover(belief(), "plane", "2", behind, behind.cov_uv)
 
 
 def test_a_small_bump_is_measured_against_the_old_place_not_against_its_sigma() -> None:

@@ -19,8 +19,9 @@ from lasercal_factors.chart import CellChart
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.graph import cell_from_state, state_from_cell
-from lasercal_gtsam.incremental.belief import Belief, calibrated_parts, coordinates, fuse
+from lasercal_gtsam.incremental.belief import Belief, calibrated_parts, coordinates
 from lasercal_gtsam.incremental.diagnosis import Diagnosis, diagnose
+from lasercal_gtsam.incremental.recover import recover
 from lasercal_gtsam.simulate import Noise, simulate
 from lasercal_gtsam.simulate.bumps import bumped, spots_in_turn
 
@@ -193,7 +194,7 @@ def error_in_sigmas(
     chi-square with as many degrees of freedom as coordinates.
     """
     columns = belief.columns(kind, NAMES[kind])  # type: ignore[arg-type]
-    fused = fuse(belief.without(columns), stream, cov, start=found.cell)
+    fused = recover(belief, kind, NAMES[kind], stream, cov, start=found.cell)  # type: ignore[arg-type]
     covariance = fused.belief.covariance[columns, columns]
     error = coordinates(fused.cell, truth)[columns]
     far = float(np.abs(error / np.sqrt(np.diag(covariance))).max())
