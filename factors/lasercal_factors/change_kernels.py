@@ -25,35 +25,51 @@ from lasercal_factors.kernels import jit
 
 _SINGLE = 15  # onsets up to this age are never merged
 _RUN_RATE = 0.9  # rate of outliers of a part that was bumped beyond all prediction
-_PRIOR_OUTLIERS, _PRIOR_SPOTS = 0.5, 500.0  # Beta prior of the rate of outliers
+_CLEAN, _DIRTY = (0.5, 500.0), (1.0, 9.0)  # Beta priors of the rate of outliers
+_DOUBT, _PART_DOUBT = 0.1, 0.01  # prior probabilities that all spots, or those of a part, are dirty
 _PART_SPOTS = 300.0  # weight, in spots, with which a part's own rate leans on the overall one
 _MEMORY = 10_000.0  # spots over which rates are remembered
 _MIDDLE = 500.0  # spots over which the middle of a plane's spots is remembered
 
 
 @jit
-def overall_rate(outliers):
-    """Mean of the Beta posterior of the rate of outliers, from ``outliers`` (2,)."""
-    return (_PRIOR_OUTLIERS + outliers[0]) / (_PRIOR_SPOTS + outliers[1])
+def _log_beta(a, b):
+    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
 
 
 @jit
-def outlier_rate(watch, camera, laser, plane):
+def _rate(counts, a, b, doubt):
+    """Posterior mean of a rate of outliers from ``counts`` (2,), prior a mixture of two.
+
+    Beta(a, b), and with probability ``doubt`` the wide Beta of `_DIRTY`: a stream is either clean
+    or it is not, and a few hundred spots tell.
+    """
+    x, good = counts[0], max(counts[1] - counts[0], 0.0)
+    c, d = _DIRTY
+    usual = _log_beta(a + x, b + good) - _log_beta(a, b)
+    dirty = _log_beta(c + x, d + good) - _log_beta(c, d) + math.log(doubt / (1.0 - doubt))
+    weight = 1.0 / (1.0 + math.exp(min(usual - dirty, 700.0)))
+    return (1.0 - weight) * (a + x) / (a + b + x + good) + weight * (c + x) / (c + d + x + good)
+
+
+@jit
+def overall_rate(counts):
+    """Posterior mean of the rate of outliers, from ``counts`` (2,)."""
+    return _rate(counts, *_CLEAN, _DOUBT)
+
+
+@jit
+def outlier_rate(overall, camera, laser, plane):
     """Running rate of outliers: the largest of the overall one and those of the three parts.
 
-    Rates of parts are shrunk to the overall one. The largest, because a
-    rate too low makes alarms and a rate too high only delays them.
+    From counts (2,). Parts are expected to be about as all together. The largest, because a rate
+    too low makes alarms and a rate too high only delays them.
     """
-    overall = overall_rate(watch.outliers)
-    rate = overall
-    for k in range(3):
-        if k == 0:
-            counts = watch.cameras.outliers[camera]
-        elif k == 1:
-            counts = watch.lasers.outliers[laser]
-        else:
-            counts = watch.planes.outliers[plane]
-        rate = max(rate, (_PART_SPOTS * overall + counts[0]) / (_PART_SPOTS + counts[1]))
+    whole = overall_rate(overall)
+    rate = whole
+    for counts in (camera, laser, plane):
+        a, b = _PART_SPOTS * whole, _PART_SPOTS * (1.0 - whole)
+        rate = max(rate, _rate(counts, a, b, _PART_DOUBT))
     return min(rate, 0.5)
 
 
@@ -65,17 +81,6 @@ def _count_outlier(counts, probability):
     if counts[1] > _MEMORY:
         counts[0] *= _MEMORY / counts[1]
         counts[1] = _MEMORY
-
-
-@jit
-def _count(watch, number):
-    """Count spot ``number`` overall, and the one `LAG` spots before it for its parts."""
-    _count_outlier(watch.outliers, watch.recent[number % len(watch.recent), 0])
-    if number >= LAG:
-        row = watch.recent[(number - LAG) % len(watch.recent)]
-        _count_outlier(watch.cameras.outliers[int(row[1])], row[0])
-        _count_outlier(watch.lasers.outliers[int(row[2])], row[0])
-        _count_outlier(watch.planes.outliers[int(row[3])], row[0])
 
 
 @jit
@@ -143,15 +148,16 @@ def _open(bank, p, m, number):
 
 
 @jit
-def _learn(bank, p, m, e, G, good, bad, unchanged, dof):
+def _learn(mean, cov, log_weight, used, e, G, common):
     """Multiply every onset by ``q / p`` of this spot and update what it knows of the change.
 
     ``e = G c + noise`` or an outlier; ``q = good |V|^-1/2 t(e - G mean; V) + bad`` with
     ``V = I + G cov G^T``; ``p = unchanged``. The spot counts in the update as far as it is
     probably no outlier (information scaled by that probability): an approximation of the posterior,
-    which costs power at worst, never false alarms.
+    which costs power at worst, never false alarms. ``common``: good, bad, unchanged, dof. Returns
+    the logarithm of the sum of the weights.
     """
-    mean, cov = bank.mean[p, m], bank.cov[p, m]
+    good, bad, unchanged, dof = common
     size = len(mean)
     a, b = np.zeros((size, SLOTS)), np.zeros((size, SLOTS))
     r0, r1 = np.full(SLOTS, e[0]), np.full(SLOTS, e[1])
@@ -170,38 +176,40 @@ def _learn(bank, p, m, e, G, good, bad, unchanged, dof):
             s01[k] += g0 * b[i, k]
             s11[k] += g1 * b[i, k]
     largest = -np.inf
-    for k in range(bank.used[p, m]):
+    for k in range(used):
         det = (1.0 + s00[k]) * (1.0 + s11[k]) - s01[k] * s01[k]
         m2 = ((1.0 + s11[k]) * r0[k] * r0[k] + (1.0 + s00[k]) * r1[k] * r1[k]) / det
         m2 -= 2.0 * s01[k] * r0[k] * r1[k] / det
         density = good * expected_density(max(m2, 0.0), dof) / math.sqrt(det)
-        bank.log_weight[p, m, k] += math.log((density + bad) / unchanged)
-        largest = max(largest, bank.log_weight[p, m, k])
+        log_weight[k] += math.log((density + bad) / unchanged)
+        largest = max(largest, log_weight[k])
         rho = density / (density + bad)
         # gain (I / rho + S)^-1, left in s
         v00, v11, v01 = 1.0 + rho * s00[k], 1.0 + rho * s11[k], rho * s01[k]
         scale = rho / (v00 * v11 - v01 * v01)
         s00[k], s01[k], s11[k] = scale * v11, -scale * v01, scale * v00
     for i in range(size):
-        for k in range(bank.used[p, m]):
+        for k in range(used):
             x0 = s00[k] * a[i, k] + s01[k] * b[i, k]
             x1 = s01[k] * a[i, k] + s11[k] * b[i, k]
             mean[i, k] += x0 * r0[k] + x1 * r1[k]
             for j in range(size):
                 cov[i, j, k] -= x0 * a[j, k] + x1 * b[j, k]
     total = 0.0
-    for k in range(bank.used[p, m]):
-        total += math.exp(bank.log_weight[p, m, k] - largest)
+    for k in range(used):
+        total += math.exp(log_weight[k] - largest)
     return largest + math.log(total)
 
 
 @jit
-def _look_at_part(bank, p, number, e, G, good, bad, unchanged, dof):
+def _look_at_part(bank, p, number, e, G, common):
     """One spot of part ``p``: a new onset, then all of them learn."""
     total = -np.inf
     for m in range(bank.log_weight.shape[1]):
         _open(bank, p, m, number)
-        total = _log_add(total, _learn(bank, p, m, e, G, good, bad, unchanged, dof))
+        mean, cov, log_weight = bank.mean[p, m], bank.cov[p, m], bank.log_weight[p, m]
+        found = _learn(mean, cov, log_weight, bank.used[p, m], e, G, common)
+        total = _log_add(total, found)
     bank.log_total[p] = total
     bank.seen[p] += 1
 
@@ -220,19 +228,17 @@ def _follow(state, share, number, log_ratio):
 
 
 @jit
-def _centre(watch, p, G):
-    """Write a plane's prior for a turn about the middle of its spots.
+def _centre(middle, prior, G):
+    """Write a plane's prior (M, 3, 3) for a turn about the middle of its spots.
 
     A spot moves along the normal by ``c_3 + s . (c_1, c_2)``, where ``s`` is read off the Jacobian;
     independent turn and shift at the mean ``s`` are correlated at the origin.
     """
-    middle = watch.middle[p]
     length = G[0, 2] * G[0, 2] + G[1, 2] * G[1, 2]
     middle[2] = min(middle[2] + 1.0, _MIDDLE)
     for i in range(2):
         s = (G[0, 2] * G[0, i] + G[1, 2] * G[1, i]) / length
         middle[i] += (s - middle[i]) / middle[2]
-    prior = watch.planes.prior[p]
     for m in range(len(prior)):
         turn0, turn1 = prior[m, 0, 0], prior[m, 1, 1]
         # the shift's own variance does not change: take out the old correlation, put in the new
@@ -243,68 +249,104 @@ def _centre(watch, p, G):
 
 
 @jit
-def log_statistic(watch):
-    """Logarithm of the sum of all onsets of all causes."""
-    total = -np.inf
-    for i in range(len(watch.spread)):
-        total = _log_add(total, watch.spread[i, 0])
-    for bank in (watch.cameras.log_total, watch.lasers.log_total, watch.planes.log_total):
-        for p in range(len(bank)):
-            total = _log_add(total, bank[p])
-    for run in (watch.cameras.run, watch.lasers.run, watch.planes.run):
-        for p in range(len(run)):
-            total = _log_add(total, run[p, 0])
-    return total
+def _log_sum(totals, start):
+    """``start`` and an array of logarithms, summed as `_log_add` does."""
+    for value in totals:
+        start = _log_add(start, value)
+    return start
 
 
 @jit
-def _look(watch, looks, i, out):
-    """One spot; fills ``out`` (4,) as in `look`."""
-    e, area, dof = looks.e[i], looks.area[i], looks.dof[i]
-    camera, laser, plane = looks.who[i, 0], looks.who[i, 1], looks.who[i, 2]
-    number = watch.number[0]
-    rate = outlier_rate(watch, camera, laser, plane)
-    m = e[0] * e[0] + e[1] * e[1]
-    if math.isfinite(m):
-        good, gross = expected_density(m, dof), outlier_density(m, area)
-        if good < 1e-300:
-            good = 0.0
-        unchanged = (1.0 - rate) * good + rate * gross
-        run_ratio = math.log(((1.0 - _RUN_RATE) * good + _RUN_RATE * gross) / unchanged)
-        probability = rate * gross / unchanged
-        # at least the density of outliers of any mixture of the two halves
-        bad = 2.0 * rate * gross
-        p = (1.0 - rate) * good + bad
-        common = (1.0 - rate, bad, p, dof)
-        _centre(watch, plane, looks.by_plane[i])
-        _look_at_part(watch.cameras, camera, number, e, looks.by_camera[i], *common)
-        _look_at_part(watch.lasers, laser, number, e, looks.by_laser[i], *common)
-        _look_at_part(watch.planes, plane, number, e, looks.by_plane[i], *common)
-        for s in range(len(watch.spread)):
-            tau2 = watch.spread_factor[s]
-            wide = (1.0 - rate) * expected_density(m / tau2, dof) / tau2 + bad
-            _follow(watch.spread[s], watch.spread_share[s], number, math.log(wide / p))
-    else:
-        run_ratio, probability, m = math.log(_RUN_RATE / rate), 1.0, np.inf
-    _follow(watch.cameras.run[camera], watch.cameras.run_share[0], number, run_ratio)
-    _follow(watch.lasers.run[laser], watch.lasers.run_share[0], number, run_ratio)
-    _follow(watch.planes.run[plane], watch.planes.run_share[0], number, run_ratio)
-    row = watch.recent[number % len(watch.recent)]
-    row[0], row[1], row[2], row[3] = probability, camera, laser, plane
-    _count(watch, number)
-    watch.number[0] = number + 1
-    out[0], out[1] = log_statistic(watch), math.sqrt(m)
-    out[2], out[3] = gate_length(rate, area, dof), probability
+def _is_whole(look, n, columns):
+    """Shape (n, 2, columns)."""
+    return look.shape[0] == n and look.shape[1] == 2 and look.shape[2] == columns
+
+
+@jit
+def _are_possible(looks, parts):
+    """Whether shapes fit, indices stay below ``parts`` and numbers are numbers."""
+    n = len(looks.e)
+    if looks.e.shape[1] != 2 or looks.who.shape[0] != n or looks.who.shape[1] != 3:
+        return False
+    if len(looks.area) != n or len(looks.dof) != n:
+        return False
+    if not (_is_whole(looks.by_camera, n, 6) and _is_whole(looks.by_laser, n, 4)):
+        return False
+    if not _is_whole(looks.by_plane, n, 3):
+        return False
+    for i in range(n):
+        for k in range(3):
+            if not 0 <= looks.who[i, k] < parts[k]:
+                return False
+        if not (looks.area[i] > 0.0 and looks.dof[i] > 0.0):
+            return False
+        if math.isfinite(looks.e[i, 0]) and math.isfinite(looks.e[i, 1]):
+            total = np.sum(looks.by_camera[i]) + np.sum(looks.by_laser[i])
+            if not math.isfinite(total + np.sum(looks.by_plane[i])):
+                return False
+            if looks.by_plane[i, 0, 2] == 0.0 and looks.by_plane[i, 1, 2] == 0.0:
+                return False
+    return True
 
 
 @jit
 def look(watch, looks, log_threshold, out):
     """Look at spots in order until the first alarm; returns how many were looked at.
 
-    ``out`` (N, 4): logarithm of the statistic, length, limit, probability to be an outlier.
+    ``out`` (N, 4): logarithm of the statistic, length, limit, probability to be an outlier. Returns
+    -1, and looks at nothing, where the input cannot be.
     """
+    parts = (len(watch.cameras.seen), len(watch.lasers.seen), len(watch.planes.seen))
+    if not _are_possible(looks, parts):
+        return -1
+    cameras, lasers, planes, recent = watch.cameras, watch.lasers, watch.planes, watch.recent
     for i in range(len(looks.e)):
-        _look(watch, looks, i, out[i])
-        if out[i, 0] >= log_threshold:
+        e, area, dof = looks.e[i], looks.area[i], looks.dof[i]
+        camera, laser, plane = looks.who[i, 0], looks.who[i, 1], looks.who[i, 2]
+        number = watch.number[0]
+        rate = outlier_rate(
+            watch.outliers, cameras.outliers[camera], lasers.outliers[laser], planes.outliers[plane]
+        )
+        m = e[0] * e[0] + e[1] * e[1]
+        if math.isfinite(m):
+            good, gross = expected_density(m, dof), outlier_density(m, area)
+            unchanged = (1.0 - rate) * good + rate * gross
+            run_ratio = math.log(((1.0 - _RUN_RATE) * good + _RUN_RATE * gross) / unchanged)
+            probability = rate * gross / unchanged
+            # at least the density of outliers of any mixture of the two halves
+            bad = 2.0 * rate * gross
+            p = (1.0 - rate) * good + bad
+            common = (1.0 - rate, bad, p, dof)
+            _centre(watch.middle[plane], planes.prior[plane], looks.by_plane[i])
+            _look_at_part(cameras, camera, number, e, looks.by_camera[i], common)
+            _look_at_part(lasers, laser, number, e, looks.by_laser[i], common)
+            _look_at_part(planes, plane, number, e, looks.by_plane[i], common)
+            for s in range(len(watch.spread)):
+                tau2 = watch.spread_factor[s]
+                wide = (1.0 - rate) * expected_density(m / tau2, dof) / tau2 + bad
+                _follow(watch.spread[s], watch.spread_share[s], number, math.log(wide / p))
+        else:
+            run_ratio, probability, m = math.log(_RUN_RATE / rate), 1.0, np.inf
+        _follow(cameras.run[camera], cameras.run_share[0], number, run_ratio)
+        _follow(lasers.run[laser], lasers.run_share[0], number, run_ratio)
+        _follow(planes.run[plane], planes.run_share[0], number, run_ratio)
+
+        row = recent[number % len(recent)]
+        row[0], row[1], row[2], row[3] = probability, camera, laser, plane
+        _count_outlier(watch.outliers, probability)
+        if number >= LAG:
+            row = recent[(number - LAG) % len(recent)]
+            _count_outlier(cameras.outliers[int(row[1])], row[0])
+            _count_outlier(lasers.outliers[int(row[2])], row[0])
+            _count_outlier(planes.outliers[int(row[3])], row[0])
+        watch.number[0] = number + 1
+
+        total = _log_sum(watch.spread[:, 0], -np.inf)
+        total = _log_sum(cameras.run[:, 0], _log_sum(cameras.log_total, total))
+        total = _log_sum(lasers.run[:, 0], _log_sum(lasers.log_total, total))
+        total = _log_sum(planes.run[:, 0], _log_sum(planes.log_total, total))
+        out[i, 0], out[i, 1] = total, math.sqrt(m)
+        out[i, 2], out[i, 3] = gate_length(rate, area, dof), probability
+        if total >= log_threshold:
             return i + 1
     return len(looks.e)

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -110,7 +110,6 @@ class Detector:
 
     watch: Watch
     threshold: float = DEFAULT_THRESHOLD
-    _out: Array = field(default_factory=lambda: np.empty((1, 4)), repr=False)
 
     @classmethod
     def start(
@@ -128,7 +127,8 @@ class Detector:
         Parameters
         ----------
         cameras, lasers, planes : numbers of parts; more may come later (`cover`)
-        outliers, good : spots seen before, rejected and used: where the rate of outliers starts
+        outliers, good : spots seen before, rejected and used: where the overall rate of outliers
+            starts; `remember` tells those of the parts too
         threshold : alarm threshold, > 1
 
         Raises
@@ -157,6 +157,30 @@ class Detector:
         """Make room for at least so many parts; new ones start with nothing seen."""
         self.watch = covering(self.watch, cameras, lasers, planes)
 
+    def remember(self, who: npt.NDArray[np.int64], outlier: npt.NDArray[np.bool_]) -> None:
+        """Count spots of an earlier calibration, so that each part's rate of outliers is known.
+
+        Parameters
+        ----------
+        who : (N, 3) indices of camera, laser and plane
+        outlier : (N,) was rejected
+
+        Raises
+        ------
+        DataError
+            Shapes that do not fit or an index out of range.
+        """
+        who, outlier = np.asarray(who), np.asarray(outlier, dtype=np.bool_)
+        if who.shape != (len(outlier), 3):
+            raise DataError(f"detector: who: expected shape {(len(outlier), 3)}, got {who.shape}")
+        problems = self._out_of_range(who)
+        if problems:
+            raise DataError(*problems)
+        self.watch.outliers[:] += [float(np.sum(outlier)), float(len(outlier))]
+        for kind, index in zip(KINDS, who.T, strict=True):
+            counts = getattr(self.watch, kind).outliers
+            np.add.at(counts, index, np.column_stack([outlier, np.ones(len(outlier))]))
+
     def look(self, spot: Look) -> Verdict:
         """Take in one spot.
 
@@ -169,10 +193,12 @@ class Detector:
 
     def look_many(self, looks: Looks) -> list[Verdict]:
         """Take in spots in order, up to the first alarm: may return fewer verdicts than spots."""
-        self._check(looks)
-        out = self._out if len(looks.e) == 1 else np.empty((len(looks.e), 4))
+        looks = _plain(looks)
+        out = np.empty((len(looks.e), 4))
         log_threshold = math.log(self.threshold)
         count = kernels.look(self.watch, looks, log_threshold, out)
+        if count < 0:
+            raise DataError(*self._problems(looks))
         return [self._verdict(row, log_threshold) for row in out[:count].tolist()]
 
     def reset(self, since: int | None = None) -> None:
@@ -238,21 +264,30 @@ class Detector:
         since = self.since() if alarm else None
         return Verdict(outlier, reason, alarm, since, log_statistic / log_threshold, length, limit)
 
-    def _check(self, looks: Looks) -> None:
+    def _problems(self, looks: Looks) -> list[str]:
+        """What is wrong with spots that were turned down."""
         n = len(looks.e)
         shapes = ((n, 2), (n, 3), (n, 2, 6), (n, 2, 4), (n, 2, 3), (n,), (n,))
-        for name, array, shape in zip(Looks._fields, looks, shapes, strict=True):
-            if array.shape != shape:
-                raise DataError(f"detector: {name}: expected shape {shape}, got {array.shape}")
-        parts = [len(getattr(self.watch, kind).seen) for kind in KINDS]
-        if n and not (np.all(looks.who >= 0) and np.all(looks.who < parts)):
-            raise DataError(f"detector: a part's index is out of range: there are {parts}")
+        found = [
+            f"detector: {name}: expected shape {shape}, got {array.shape}"
+            for name, array, shape in zip(Looks._fields, looks, shapes, strict=True)
+            if array.shape != shape
+        ]
+        if found:
+            return found
+        found = self._out_of_range(looks.who)
         if not (np.all(looks.area > 0) and np.all(looks.dof > 0)):
-            raise DataError("detector: area and degrees of freedom must be positive")
-        possible = np.isfinite(looks.e).all(axis=1)
-        for name in ("by_camera", "by_laser", "by_plane"):
-            if not np.isfinite(getattr(looks, name)[possible]).all():
-                raise DataError(f"detector: {name}: expected finite numbers")
+            found.append("detector: area and degrees of freedom must be positive")
+        return found or ["detector: derivatives must be finite, and a plane must move its spots"]
+
+    def _out_of_range(self, who: npt.NDArray[np.int64]) -> list[str]:
+        found = []
+        for kind, index in zip(KINDS, who.T, strict=True):
+            count = len(getattr(self.watch, kind).seen)
+            bad = index[(index < 0) | (index >= count)]
+            if len(bad):
+                found.append(f"detector: {kind}: there are {count}, got index {bad[0]}")
+        return found
 
     def _uncount(self, since: int) -> None:
         watch = self.watch
@@ -266,11 +301,24 @@ class Detector:
             watch.recent[i % len(watch.recent), 0] = 0.0
 
 
+def _plain(looks: Looks) -> Looks:
+    """Arrays of the types that are compiled for."""
+    return Looks(
+        np.ascontiguousarray(looks.e, dtype=np.float64),
+        np.ascontiguousarray(looks.who, dtype=np.int64),
+        np.ascontiguousarray(looks.by_camera, dtype=np.float64),
+        np.ascontiguousarray(looks.by_laser, dtype=np.float64),
+        np.ascontiguousarray(looks.by_plane, dtype=np.float64),
+        np.ascontiguousarray(looks.area, dtype=np.float64),
+        np.ascontiguousarray(looks.dof, dtype=np.float64),
+    )
+
+
 def _looks(spot: Look) -> Looks:
     """One spot as arrays."""
 
     def one(value: npt.ArrayLike) -> Array:
-        return np.ascontiguousarray(value, dtype=np.float64)[None]
+        return np.asarray(value, dtype=np.float64)[None]
 
     return Looks(
         one(spot.e),

@@ -125,6 +125,26 @@ def false_alarms(
     return alarms, largest, cpu / spots * 1e6
 
 
+def false_alarms_at_start(streams: int, spots: int, dof: int = 52, seed: int = 0) -> list[int]:
+    """Spots at which streams alarm whose noise is only known from a start with ``dof``.
+
+    The scale is estimated on as the stream goes, as the calibrator does.
+    """
+    pool, alarms = make_pool(seed, 1.0, before=40), []
+    for stream in range(streams):
+        rng = np.random.default_rng([seed, 3, stream])
+        z = rng.standard_normal((spots, 2))
+        nu = dof + 2.0 * np.arange(spots)
+        sums = rng.chisquare(dof) + np.concatenate([[0.0], np.cumsum((z**2).sum(axis=1))[:-1]])
+        scale = np.sqrt(sums / nu)
+        looks = looks_of(pool, rng.integers(len(pool), size=spots), z / scale[:, None])
+        detector = Detector.start(1, 1, 3, good=40)
+        verdicts = detector.look_many(looks._replace(dof=nu))
+        if verdicts[-1].alarm:
+            alarms.append(len(verdicts))
+    return alarms
+
+
 def moved_cell(pool: Pool, part: str, turn_deg: float, shift_mm: float, seed: int) -> Cell:
     """The cell with one part moved in a random direction; planes: always the first."""
     rng, cell = np.random.default_rng([seed, 7]), pool.cell
