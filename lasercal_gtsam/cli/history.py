@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -133,7 +134,8 @@ def _table(rows: Sequence[HistoryRow], names: Sequence[str]) -> str:
     lines = [header]
     for row in rows:
         there = {p.name: p for p in row.parameters}
-        cells = [str(row.spots), f"{row.rms_px:.4g}", f"{row.sigma0:.4g}"]
+        scales = (row.rms_px, row.sigma0)
+        cells = [str(row.spots), *("" if math.isnan(x) else f"{x:.4g}" for x in scales)]
         for name in names:
             p = there.get(name)
             if p is None:
