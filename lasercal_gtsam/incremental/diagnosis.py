@@ -87,6 +87,17 @@ class Diagnosis:
     cell: Cell
     good: Array
 
+    @property
+    def settled(self) -> bool:
+        """Whether the most probable cause is probable enough to act on.
+
+        `SURE` for what has moved, and for the robot. For outliers one half: displacements too small
+        to be seen explain good spots about as well as none, and keep a share for any number of
+        spots.
+        """
+        best = self.causes[0]
+        return best.probability >= (0.5 if best.kind == "outliers" else SURE)
+
 
 def diagnose(
     belief: Belief,

@@ -34,7 +34,6 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import cell_from_state, state_from_cell
 from lasercal_gtsam.incremental.belief import Belief, expansion, part_offset
 from lasercal_gtsam.observations import Observations
-from lasercal_gtsam.report_map import CAMERA_TANGENT
 
 Index = npt.NDArray[np.int64]
 
@@ -235,20 +234,16 @@ def _square_root(belief: Belief, columns: Index) -> Array:
     """``L`` (n, k) with ``L L'`` the covariance of these columns; zero rows elsewhere."""
     information, n = belief.information, len(belief.held)
     known = ~belief.held & (np.diag(information) > 0)
-    fu = [
-        part_offset(belief.cell, "camera", name) + CAMERA_TANGENT.index("fu")
-        for name in belief.aspect
-    ]
-    unknown = np.setdiff1d(columns[~known[columns] & ~belief.held[columns]], fu)
     rows = np.flatnonzero(known)
     scale = 1.0 / np.sqrt(np.diag(information)[rows])
-    if len(unknown) == 0:
-        try:
-            C = np.linalg.cholesky(information[np.ix_(rows, rows)] * np.outer(scale, scale))
-        except np.linalg.LinAlgError:
-            unknown = rows
-    if len(unknown):
-        raise DegenerateError("what the spots involve is not determined by what is known before")
+    try:
+        if not (known | belief.held)[columns].all():
+            raise np.linalg.LinAlgError
+        C = np.linalg.cholesky(information[np.ix_(rows, rows)] * np.outer(scale, scale))
+    except np.linalg.LinAlgError:
+        raise DegenerateError(
+            "what the spots involve is not determined by what is known before"
+        ) from None
     free = np.flatnonzero(~belief.held)
     L = np.zeros((len(free), len(rows)))
     L[np.searchsorted(free, rows)] = scale[:, None] * np.linalg.inv(C).T

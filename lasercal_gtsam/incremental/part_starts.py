@@ -42,6 +42,8 @@ from lasercal_gtsam.rotations import make_pose, rotation_exp
 Index = npt.NDArray[np.int64]
 
 _SAMPLES = 30
+# spots of a sample for resection, which takes six exact ones
+_RESECTED = 8
 # squared length (sigmas) where a residual stops to matter, and of a spot that cannot be
 _THRESHOLD = 2.385**2
 _IMPOSSIBLE = 1e12
@@ -136,13 +138,18 @@ def _poses_from_three(points: Array, xy: Array) -> Iterator[Array]:
 def _resected(
     cell: Cell, seen: Observations, points: Array, size: tuple[int, int]
 ) -> Iterator[Camera]:
-    """Cameras with intrinsics from known points: every way of `closed_form.camera`."""
+    """Cameras with intrinsics from known points: every way of `closed_form.camera`.
+
+    Resection is tried on samples too, in case some spots are bad.
+    """
     good = np.isfinite(points).all(axis=1)
     scaling = pixel_scaling(size)
     xy = transformed(scaling, seen.uv)
     found: list[Resection] = []
-    with suppress(DegenerateError, np.linalg.LinAlgError):
-        found.append(resection(points[good], xy[good]))
+    samples = _samples(points, _RESECTED) if good.sum() > _RESECTED else ()
+    for sample in (np.flatnonzero(good), *samples):
+        with suppress(DegenerateError, np.linalg.LinAlgError):
+            found.append(resection(points[sample], xy[sample]))
     planes = [p for p in seen.planes if (good & (seen.plane == p)).sum() >= 4]
     rows = [np.flatnonzero(good & (seen.plane == p)) for p in planes]
     normals = np.array([cell.planes[p].normal_base for p in planes])

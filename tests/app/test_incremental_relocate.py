@@ -181,6 +181,17 @@ def test_a_new_camera_keeps_usual_values_where_the_spots_say_nothing() -> None:
     assert np.isfinite(lens.vector).all()
 
 
+def test_a_new_camera_is_found_among_outliers() -> None:
+    old = truth(2)
+    rest = without_part(old, "camera", "camera")
+    for seed in range(3):
+        spots = spots_in_turn(old, 24, seed=seed, pixel_px=0.3)
+        spots = outliers_among(with_sigma(spots, 0.3), [2, 9, 13], np.random.default_rng(seed))
+        found = with_part(old, "camera", "camera", locate_camera(rest, spots))
+        error = np.linalg.norm(predicted(found, spots) - spots.uv, axis=1)
+        assert np.delete(error, [2, 9, 13]).max() < 3.0
+
+
 def test_few_spots_on_one_plane_may_leave_two_poses() -> None:
     ambiguous = 0
     for seed in range(20):
