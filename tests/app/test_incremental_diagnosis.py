@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from bump_cases import bumped, outliers_among, spots_in_turn, with_sigma
 from core_cases import differences, simulated
-from incremental_cases import bumped, outliers_among, spots_in_turn, with_sigma
 from test_core_cameras import capture, two_eyed_cell
 
 import lasercal_gtsam as lc

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from core_cases import differences, simulated
-from incremental_cases import (
+from bump_cases import (
     bumped,
     outliers_among,
     spots_in_turn,
@@ -15,6 +14,7 @@ from incremental_cases import (
     with_sigma,
     without_part,
 )
+from core_cases import differences, simulated
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.incremental.relocate import (
