@@ -301,25 +301,22 @@ class IncrementalCalibrator:
         self._note("started", f"from a calibration of {fit.n_spots} spots, by its covariance")
 
     def _begin(self, found: Calibration, words: str = "") -> None:
-        """From a batch solution of all stored spots."""
+        """From a batch solution of all stored spots, or of those that are used so far."""
         self._set_noise(found)
-        rejected = [reason is not None for reason in found.spots.rejected]
-        self._store.mark_each(
-            self._store.first, np.where(rejected, LEFT_OUT, USED).astype(np.uint8)
-        )
-        scale = found.fit.sigma0 / self._unit
-        filter = self._start_filter(calibrated_parts(found), found, scale=scale)
+        fit = found.fit
+        if fit.n_spots + fit.n_rejected == len(self._store):
+            rejected = [reason is not None for reason in found.spots.rejected]
+            marks = np.where(rejected, LEFT_OUT, USED).astype(np.uint8)
+            self._store.mark_each(self._store.first, marks)
+        filter = self._start_filter(calibrated_parts(found), found, scale=fit.sigma0 / self._unit)
         filter.use(self._store.first, self._store.end)
         filter.relinearise()
         self._missing, self._next_audit = (), int(_AUDIT_GROWTH * len(self._store))
-        self._note(
-            "started", words or f"with {found.fit.n_spots} spots, RMS {found.fit.rms_px:.3g} px"
-        )
+        self._note("started", words or f"with {fit.n_spots} spots, RMS {fit.rms_px:.3g} px")
 
     def _set_noise(self, found: Calibration) -> None:
         """Pixel sigma for spots without one; found along with the robot's noise, if not stated."""
-        options = self._options
-        if options.sigma_px is None and (options.hand_sigma_m > 0 or options.hand_sigma_rad > 0):
+        if self._finds_sigma:
             self._sigma_px = self._unit = found.fit.sigma0
 
     def _start_filter(
@@ -353,7 +350,7 @@ class IncrementalCalibrator:
             len(cell.cameras),
             len(cell.lasers),
             len(cell.planes),
-            outliers=found.fit.n_rejected,
+            outliers=self._older - self._used_before + self._rejected(),
             good=found.fit.n_spots,
         )
         self._looked_at.clear()
@@ -385,14 +382,29 @@ class IncrementalCalibrator:
         self._next_audit = int(_AUDIT_GROWTH * count)
         if self._open or self._pending or self._fade < 1.0:
             return
+        used = np.flatnonzero(self._store.marks() == USED)
+        # outliers stay out: looking for them anew would take seconds
+        spots, plain = self._store.observations()[used], replace(self._options, robust="none")
         try:
-            found = calibrate(self._store.observations(), options=self._options)
+            found = calibrate(spots, options=plain)
         except LasercalError:
             return
         fit, now = found.fit, filter.estimate
-        gain = now.cost / now.sigma0**2 - fit.dof * (fit.sigma0 / self._unit / now.sigma0) ** 2
-        if fit.converged and fit.n_rejected <= self._rejected() and gain > _TOLD_APART:
-            self._begin(found, f"anew with {fit.n_spots} spots: a better solution was found")
+        if not fit.converged:
+            return
+        if self._finds_sigma:
+            words = f"anew with {fit.n_spots} spots: their noise is {fit.sigma0:.3g} px"
+        elif now.cost - fit.dof * fit.sigma0**2 > _TOLD_APART * now.sigma0**2:
+            words = f"anew with {fit.n_spots} spots: a better solution was found"
+        else:
+            return
+        self._begin(found, words)
+
+    @property
+    def _finds_sigma(self) -> bool:
+        """Whether the pixel sigma has to be told apart from the robot's noise."""
+        o = self._options
+        return o.sigma_px is None and (o.hand_sigma_m > 0 or o.hand_sigma_rad > 0)
 
     def _rejected(self) -> int:
         return int((self._store.marks() == LEFT_OUT).sum())
