@@ -159,4 +159,5 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
 def _px(judged: Judged) -> str:
     if not np.isfinite(judged.residual_px):
         return "no solution"
-    return f"{judged.residual_px:.2g} px"
+    more = " or more" if judged.stage == "screened" else ""
+    return f"{judged.residual_px:.2g} px{more}"

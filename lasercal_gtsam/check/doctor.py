@@ -9,7 +9,7 @@ Nothing is switched: the doctor only says what it found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -36,15 +36,13 @@ from lasercal_gtsam.robust import consensus, lengths_of, rejection_length
 from lasercal_gtsam.start import Search
 
 Progress = Callable[[int, int], None]
-_Result = TypeVar("_Result")
+_Item = TypeVar("_Item")
 
 _MOST_SPOTS = 300
-# a reading that leaves this many times what the best leaves at first sight is not solved, unless it
-# is one of the best few
+# a reading that leaves this many times what the best leaves at first sight is not solved; where
+# even the best leaves too much, this many are, for nobody can say why
 _HOPELESS = 10.0
-_KEPT = 4
-# readings that mirrored pixels are tried on, and readings that are refined
-_MOST_MIRRORED = 2
+_KEPT = 6
 _MOST_REFINED = 5
 _STARTS = 3
 # share of a credible residual at which no further start is tried
@@ -77,44 +75,42 @@ def diagnose(
     poses = [replace(pose, T_base_hand=pose.T_base_hand[rows]) for pose in poses]
     bench = _Bench.of(observations[rows], options)
     steps = _Steps(progress, len(poses))
-    misfits = bench.misfits_px(poses, AS_DECLARED, steps)
-    mirrored = misfits
+    trials = [_Trial(pose, AS_DECLARED) for pose in poses]
+    misfits = bench.misfits_px(trials, steps)
+    likely = int(np.argmin(misfits))
     credible = CREDIBLE * bench.diagonal_px
-    if misfits.min() > credible:
-        steps.total += len(poses)
-        mirrored = bench.misfits_px(poses, MIRRORED[0], steps)
-    kept = _worth_solving(misfits, credible)
-    trials = [_Trial(poses[k], AS_DECLARED) for k in kept] + [_Trial(poses[0], TURNED)]
-    steps.total += len(trials) + len(MIRRORED) * min(len(poses), _MOST_MIRRORED)
-    solved = [steps.after(bench.solve(trial)) for trial in trials]
-    first = {k: found.residual_px for k, found in zip(kept, solved, strict=False)}
-    likely = sorted(range(len(poses)), key=lambda k: (k != 0, mirrored[k], first.get(k, np.inf)))
-    solved += [
-        steps.after(bench.solve(_Trial(poses[k], pixels)))
-        for k in likely[:_MOST_MIRRORED]
-        for pixels in MIRRORED
-    ]
-    if all(s.trouble for s in solved):
-        raise DegenerateError(solved[0].trouble)
-    order = np.argsort([s.residual_px for s in solved], kind="stable")
-    refined = {0, len(kept), *(int(k) for k in order[:_MOST_REFINED])}  # declared, and turned
-    solved = [bench.refine(s) if k in refined else s for k, s in enumerate(solved)]
-    limit_px = rejection_length(len(rows)) * min(s.residual_px for s in solved)
-    judged = [s.judged(limit_px) for s in solved]
-    judged += [
-        Judged(poses[k].words, poses[k].change, float(misfits[k]), 0, "screened")
-        for k in range(len(poses))
-        if k not in kept
+    if misfits[likely] > credible:  # perhaps only because the pixels are mirrored
+        mirrored = bench.misfits_px([_Trial(pose, MIRRORED[0]) for pose in poses], steps)
+        likely = int(np.argmin(mirrored))
+    more = [_Trial(poses[0], TURNED)]
+    more += [_Trial(poses[k], pixels) for k in sorted({0, likely}) for pixels in MIRRORED]
+    misfits = np.concatenate([misfits, bench.misfits_px(more, steps)])
+    trials += more
+    worth = _worth_solving(misfits, credible)
+    solved = {k: bench.solve(trials[k]) for k in steps.through(worth)}
+    if all(s.trouble for s in solved.values()):
+        raise DegenerateError(next(iter(solved.values())).trouble)
+    ranked = sorted(solved, key=lambda k: solved[k].residual_px)
+    refined = {*ranked[:_MOST_REFINED], *(k for k in solved if trials[k].pose is poses[0])}
+    for k in steps.through(sorted(refined)):
+        solved[k] = bench.refine(solved[k])
+    limit_px = rejection_length(len(rows)) * min(s.residual_px for s in solved.values())
+    judged = [
+        solved[k].judged(limit_px) if k in solved else trial.screened(float(misfits[k]))
+        for k, trial in enumerate(trials)
     ]
     return judge(judged, len(rows), bench.diagonal_px)
 
 
 def _worth_solving(misfits_px: Array, credible_px: float) -> list[int]:
-    """Readings to solve: the declared one (0) first, the best few, and all not hopeless."""
-    order = [int(k) for k in np.argsort(misfits_px, kind="stable")]
+    """Trials that are not hopeless at first sight; where all are, the declared (0) and the best."""
     best = float(np.min(misfits_px[misfits_px > 0], initial=np.inf))  # 0: nothing can be said
-    limit = _HOPELESS * best if best <= credible_px else 0.0
-    return [0, *(k for i, k in enumerate(order) if k and (i < _KEPT or misfits_px[k] <= limit))]
+    if np.isfinite(best) and best <= credible_px:
+        return [int(k) for k in np.flatnonzero(misfits_px <= _HOPELESS * best)]
+    if not misfits_px.any():
+        return list(range(len(misfits_px)))
+    order = np.argsort(misfits_px, kind="stable")[:_KEPT]
+    return sorted({0, *(int(k) for k in order)})
 
 
 def _evenly(observations: Observations) -> Index:
@@ -130,16 +126,19 @@ def _evenly(observations: Observations) -> Index:
 
 
 class _Steps:
-    """Counts what is done, for the progress bar."""
+    """Counts what is done, for the progress bar; more to do may turn up on the way."""
 
     def __init__(self, show: Progress | None, total: int) -> None:
         self.show, self.total, self.done = show, total, 0
 
-    def after(self, result: _Result) -> _Result:
-        self.done += 1
-        if self.show is not None:
-            self.show(self.done, self.total)
-        return result
+    def through(self, todo: Sequence[_Item]) -> Iterator[_Item]:
+        """Go through a list."""
+        self.total = max(self.total, self.done + len(todo))
+        for item in todo:
+            yield item
+            self.done += 1
+            if self.show is not None:
+                self.show(self.done, self.total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +147,20 @@ class _Trial:
 
     pose: PoseReading
     pixels: PixelReading
+
+    @property
+    def words(self) -> str:
+        return ", ".join(filter(None, [self.pose.words, self.pixels.words]))
+
+    @property
+    def change(self) -> tuple[str, ...]:
+        return (*self.pose.change, *self.pixels.change)
+
+    def screened(self, misfit_px: float) -> Judged:
+        """What remains of it if it was hopeless at first sight."""
+        return Judged(
+            self.words, self.change, misfit_px, 0, "screened", harmless=self.pixels is TURNED
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,17 +177,16 @@ class _Solved:
 
     def judged(self, limit_px: float) -> Judged:
         """What remains of it; spots with a residual up to ``limit_px`` fit."""
-        pose, pixels = self.trial.pose, self.trial.pixels
         seen = self.search.observations
         return Judged(
-            ", ".join(filter(None, [pose.words, pixels.words])),
-            (*pose.change, *pixels.change),
+            self.trial.words,
+            self.trial.change,
             self.residual_px,
             int((self.lengths <= limit_px).sum()),
             self.stage,
             wrong_side=bool(self.cells) and seen_from_behind(self.cells[0], seen) > 0.5,
             off_centre_px=max((_off_centre(cell) for cell in self.cells[:1]), default=0.0),
-            harmless=pixels is TURNED,
+            harmless=self.trial.pixels is TURNED,
             trouble=self.trouble,
         )
 
@@ -205,18 +217,14 @@ class _Bench:
             uv[mine] = trial.pixels.apply(uv[mine], self.observations.image_size[camera])
         return replace(self.observations, uv=uv, T_base_hand=trial.pose.T_base_hand)
 
-    def misfits_px(
-        self, poses: Sequence[PoseReading], pixels: PixelReading, steps: _Steps
-    ) -> Array:
+    def misfits_px(self, trials: Sequence[_Trial], steps: _Steps) -> Array:
         """What each reading leaves at first sight; hopeless ones are not followed to the end."""
         found: list[float] = []
         give_up = np.inf
-        for pose in poses:
-            seen = self.read(_Trial(pose, pixels))
-            px = misfit_px(seen, self.hints["group_tolerance_rad"], give_up)
-            found.append(steps.after(px))
-            if px > 0:
-                give_up = min(give_up, _HOPELESS * px)
+        for trial in steps.through(trials):
+            found.append(misfit_px(self.read(trial), self.hints["group_tolerance_rad"], give_up))
+            if found[-1] > 0:
+                give_up = min(give_up, _HOPELESS * found[-1])
         return np.array(found)
 
     def solve(self, trial: _Trial) -> _Solved:

@@ -29,7 +29,7 @@ def misfit_px(
 ) -> float:
     """Residual (px) that a reading leaves at first sight, of the worst camera and laser.
 
-    0 where the shots form no groups that say anything of the beam; infinite where no cell came out.
+    0 where the shots form no groups that say anything of the beam.
     From ``give_up_px`` on nobody wants to know it more exactly.
     """
     worst = 0.0
@@ -46,15 +46,15 @@ def misfit_px(
 
 
 def _of_cells(spots: Spots, directions: Array) -> float:
-    """Least median distance of the cells that beams of these directions give."""
+    """Least median distance of the cells that beams of these directions give; 0 without cells."""
     planes = scaled_planes(spots)
     beams = beams_from_directions(directions, planes)
-    lowest = np.inf
+    found = []
     try:
         for _, solution in solutions_from_beams(spots, planes, beams, KnownIntrinsics()):
             # in a mirrored picture the right beam leaves all spots behind the camera: not hopeless
             distances = spot_distances(beam_towards_spots(solution, spots), spots)
-            lowest = min(lowest, float(np.median(distances)))
+            found.append(float(np.median(distances)))
     except DegenerateError:
-        return np.inf
-    return lowest
+        pass
+    return min(found, default=0.0)
