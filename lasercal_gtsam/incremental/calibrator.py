@@ -59,8 +59,12 @@ from lasercal_gtsam.robust import rejection_length
 _FIRST_DOF, _FIRST_SPOTS, _ATTEMPT_GROWTH = 20, 15, 1.05
 # a cause this probable is acted on: by itself if it is "outliers", else where that is wanted
 _SURE = 0.99
-# spots behind an alarm that are looked at, and that must be there before anything is done by itself
-_DIAGNOSED, _FEWEST = 40, 6
+# spots behind an alarm that must be there before anything is done by itself, up to which it is
+# looked into at each spot, then at every fifth, and up to which at all
+_FEWEST, _AT_EACH, _DIAGNOSED = 6, 20, 40
+# spots after which "outliers" need only be more probable than all else together: a small shift
+# can never be excluded, and is noticed again if it is there
+_LONG_ENOUGH = 15
 # while there are few spots, closed form and search are repeated at this growth, up to this many
 _AUDIT_GROWTH, _AUDITED = 1.33, 300
 _TOLD_APART = 9.0
@@ -482,7 +486,7 @@ class IncrementalCalibrator:
         if alarm is None:
             return
         count = self._store.end - self._since
-        if count > _DIAGNOSED and alarm.causes:
+        if alarm.causes and (count > _DIAGNOSED or (count > _AT_EACH and count % 5)):
             self._alarm = replace(alarm, spots=count)
             return
         spots = self._store.observations(
@@ -502,7 +506,10 @@ class IncrementalCalibrator:
         if not alarm.causes:
             self._note("alarm", words)
         cause = found.causes[0]
-        if cause.probability < _SURE or count < _FEWEST:
+        sure = cause.probability >= _SURE
+        if cause.kind == "outliers" and count >= _LONG_ENOUGH:
+            sure = cause.probability > 0.5
+        if not sure or count < _FEWEST:
             return
         if cause.kind == "outliers":
             self._end_alarm("withdrawn", f"nothing has moved since spot {alarm.since}: outliers")
@@ -588,11 +595,15 @@ class IncrementalCalibrator:
         """Take in a part that was located, and the spots that waited for it alone."""
         old = self._running()
         is_new = name not in getattr(old.template, f"{kind}s")
+        if isinstance(part, Camera) and not is_new:
+            # the chart's intrinsics stay where the prior's coordinates begin
+            part = replace(old.template.cameras[name], T_base_camera=part.T_base_camera)
         cell = with_part(old.template, kind, name, part)
         if is_new:
             self._initial = with_part(self._initial, kind, name, part)
         self._open.discard((kind, name))
         self._filter = self._relaid(old, cell, kind, name)
+        self._filter.folded, self._filter.fallbacks = old.folded, old.fallbacks
         counts = len(cell.cameras), len(cell.lasers), len(cell.planes)
         self._detector.cover(*counts)
         self._use_ready()
