@@ -22,6 +22,8 @@ Index = npt.NDArray[np.int64]
 
 # where a part's columns begin in the kernels' rows
 _ROW_OFFSET: dict[Part, int] = {"camera": 0, "laser": 15, "plane": 19}
+# squared length (sigmas) that stands for a spot that cannot be
+_IMPOSSIBLE = 1e12
 _MAX_ITERATIONS = 60
 _LARGEST_DAMPING = 1e8
 # a step this short, in sigmas, ends the iteration: the next one would be its square
@@ -35,7 +37,7 @@ class PartFit:
     Attributes
     ----------
     cell : with the part as fitted
-    cost : sum of the losses over the spots that can be; infinite if none can
+    cost : sum of the losses; those that cannot be count as very far; infinite if none can be
     rows : (2n, k) derivative of the whitened pixels by the part's tangent coordinates, weighted by
         the loss, spots in the observations' order
     """
@@ -56,7 +58,7 @@ def fit_part(
     """Levenberg-Marquardt on the pixels over some tangent coordinates of one part.
 
     Spots that cannot be at the start (behind the camera, beam off its plane) are left out: they are
-    outliers, or the start is one that the caller compares by its cost and drops.
+    outliers, or the start is a bad one, as its cost then shows.
 
     Parameters
     ----------
@@ -109,7 +111,8 @@ def fit_part(
         {**cell.lasers, **fitted.lasers},
         {**cell.planes, **fitted.planes},
     )
-    return PartFit(everything, cost, J)
+    lost = float(kernels.loss_value(LOSSES[loss.name], loss.threshold, _IMPOSSIBLE))
+    return PartFit(everything, cost + lost * int((~possible).sum()), J)
 
 
 def _rows(

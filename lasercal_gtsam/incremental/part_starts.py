@@ -47,8 +47,9 @@ _RESECTED = 8
 # squared length (sigmas) where a residual stops to matter, and of a spot that cannot be
 _THRESHOLD = 2.385**2
 _IMPOSSIBLE = 1e12
-# a beam's point lies at least this far behind every spot (m)
-_AHEAD = 0.02
+# a beam's point lies at least this far behind every spot of its own (m), and these are no farther
+# from the beam than that
+_AHEAD, _BESIDE = 0.02, 0.03
 
 
 def planes_through_three(cell: Cell, seen: Observations) -> list[Plane]:
@@ -84,14 +85,17 @@ def beams_through_two(cell: Cell, seen: Observations, name: str) -> list[Beam]:
     u, X = along[good] / size[good, None], X[good, 0]
     if not len(u):
         return []
-    ahead = u @ points[np.isfinite(points).all(axis=1)].T
+    seen_at = points[np.isfinite(points).all(axis=1)]
+    ahead = u @ seen_at.T
     known = cell.lasers.get(name)
     forward = np.median(ahead, axis=1) if known is None else u @ known.direction_hand
     sign = np.where(forward < 0, -1.0, 1.0)[:, None]
     u, ahead = sign * u, sign * ahead
     q = X - (u * X).sum(axis=1)[:, None] * u
-    # every spot is to lie ahead of the beam's point
-    q += np.minimum(0.0, ahead.min(axis=1) - _AHEAD)[:, None] * u
+    # every spot of this beam is to lie ahead of its point; bad spots have no say
+    across = np.linalg.norm(seen_at - q[:, None] - ahead[..., None] * u[:, None], axis=2)
+    first = np.where(across < _BESIDE, ahead, np.inf).min(axis=1)
+    q += np.minimum(0.0, first - _AHEAD)[:, None] * u
     u_base = np.einsum("nij,kj->kni", R, u)
     q_base = np.einsum("nij,kj->kni", R, q) + t
     n = np.array([cell.planes[p].normal_base for p in plane])

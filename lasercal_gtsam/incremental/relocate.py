@@ -266,7 +266,8 @@ def _fit_new_camera(begin: Cell, observations: Observations, name: str) -> PartF
             continue
         f = fit.cell.cameras[name].intrinsics.fv
         limits = _LENS_LIMITS * np.array([f, f, 1, 1, 1, 1, 1, 1, 1])
-        scale = np.concatenate([np.full(6, TURN_RANGE), limits])[list(coordinates)]
+        ranges = np.repeat([TURN_RANGE, SHIFT_RANGE], 3)
+        scale = np.concatenate([ranges, limits])[list(coordinates)]
         s = np.linalg.svd(fit.rows * scale, compute_uv=False)
         if s[-1] > 1.0:
             return fit

@@ -159,6 +159,15 @@ def test_a_bump_does_not_reverse_the_beam() -> None:
         ).all()
 
 
+def test_bad_spots_do_not_push_the_beam_s_point_away() -> None:
+    for seed in range(10):
+        old, _, spots = after_bump("laser", seed, 5.0, 20.0, count=10)
+        clean = locate_laser(old, spots)
+        spots = outliers_among(spots, [1, 6], np.random.default_rng(seed))
+        found = locate_laser(old, spots)
+        assert np.linalg.norm(found.point_hand) < np.linalg.norm(clean.point_hand) + 0.03
+
+
 def test_a_new_camera_gets_its_intrinsics() -> None:
     old = truth(0, "paper-distorted")
     spots = spots_in_turn(old, 45, seed=4)
