@@ -4,12 +4,12 @@ The statistic is that of Shiryaev (1963) and Roberts (1966), ``R_n = sum_k L_k^n
 ``k <= n``, ``L_k^n`` the likelihood ratio of spots k..n under "changed at k" against "unchanged".
 Every onset starts with weight one and is multiplied, spot by spot, by ``q(e) / p(e)``: its own
 predictive density over that of an unchanged cell. Hence ``R_n - n`` is a martingale while nothing
-changes, and the mean number of spots to a false alarm at ``R >= A`` is at least
-``A`` (Pollak 1985).
-That holds for any predictive density ``q`` chosen before the spot is seen: for mixtures of causes,
-for a change that is itself estimated on the way, and when two onsets are merged.
+changes, and the mean number of spots to a false alarm at ``R >= A`` is at least ``A`` (Pollak
+1985). That holds for any predictive density ``q`` chosen before the spot is seen: for mixtures of
+causes, for a change that is itself estimated on the way, and when two onsets are merged.
 
-Densities as in `change_densities`; arrays as in `change_arrays`. Arrays keep the onsets along the
+Densities as in `change_densities`, rates of outliers as in `change_rates`, arrays as in
+`change_arrays`. Arrays keep the onsets along the
 last axis, so that loops run several at a time.
 """
 
@@ -21,66 +21,12 @@ import numpy as np
 
 from lasercal_factors.change_arrays import LAG, SLOTS, WINDOW
 from lasercal_factors.change_densities import expected_density, gate_length, outlier_density
+from lasercal_factors.change_rates import count_outlier, outlier_rate
 from lasercal_factors.kernels import jit
 
 _SINGLE = 15  # onsets up to this age are never merged
 _RUN_RATE = 0.9  # rate of outliers of a part that was bumped beyond all prediction
-_CLEAN, _DIRTY = (0.5, 500.0), (1.0, 9.0)  # Beta priors of the rate of outliers
-_DOUBT, _PART_DOUBT = 0.1, 0.01  # prior probabilities that all spots, or those of a part, are dirty
-_PART_SPOTS = 300.0  # weight, in spots, with which a part's own rate leans on the overall one
-_MEMORY = 10_000.0  # spots over which rates are remembered
 _MIDDLE = 500.0  # spots over which the middle of a plane's spots is remembered
-
-
-@jit
-def _log_beta(a, b):
-    return math.lgamma(a) + math.lgamma(b) - math.lgamma(a + b)
-
-
-@jit
-def _rate(counts, a, b, doubt):
-    """Posterior mean of a rate of outliers from ``counts`` (2,), prior a mixture of two.
-
-    Beta(a, b), and with probability ``doubt`` the wide Beta of `_DIRTY`: a stream is either clean
-    or it is not, and a few hundred spots tell.
-    """
-    x, good = counts[0], max(counts[1] - counts[0], 0.0)
-    c, d = _DIRTY
-    usual = _log_beta(a + x, b + good) - _log_beta(a, b)
-    dirty = _log_beta(c + x, d + good) - _log_beta(c, d) + math.log(doubt / (1.0 - doubt))
-    weight = 1.0 / (1.0 + math.exp(min(usual - dirty, 700.0)))
-    return (1.0 - weight) * (a + x) / (a + b + x + good) + weight * (c + x) / (c + d + x + good)
-
-
-@jit
-def overall_rate(counts):
-    """Posterior mean of the rate of outliers, from ``counts`` (2,)."""
-    return _rate(counts, *_CLEAN, _DOUBT)
-
-
-@jit
-def outlier_rate(overall, camera, laser, plane):
-    """Running rate of outliers: the largest of the overall one and those of the three parts.
-
-    From counts (2,). Parts are expected to be about as all together. The largest, because a rate
-    too low makes alarms and a rate too high only delays them.
-    """
-    whole = overall_rate(overall)
-    rate = whole
-    for counts in (camera, laser, plane):
-        a, b = _PART_SPOTS * whole, _PART_SPOTS * (1.0 - whole)
-        rate = max(rate, _rate(counts, a, b, _PART_DOUBT))
-    return min(rate, 0.5)
-
-
-@jit
-def _count_outlier(counts, probability):
-    """Count a spot, fading the past beyond `_MEMORY` spots."""
-    counts[0] += probability
-    counts[1] += 1.0
-    if counts[1] > _MEMORY:
-        counts[0] *= _MEMORY / counts[1]
-        counts[1] = _MEMORY
 
 
 @jit
@@ -177,17 +123,21 @@ def _learn(mean, cov, log_weight, used, e, G, common):
             s11[k] += g1 * b[i, k]
     largest = -np.inf
     for k in range(used):
-        det = (1.0 + s00[k]) * (1.0 + s11[k]) - s01[k] * s01[k]
-        m2 = ((1.0 + s11[k]) * r0[k] * r0[k] + (1.0 + s00[k]) * r1[k] * r1[k]) / det
-        m2 -= 2.0 * s01[k] * r0[k] * r1[k] / det
-        density = good * expected_density(max(m2, 0.0), dof) / math.sqrt(det)
+        # sums of terms that are not negative but for rounding, however large the information
+        sound = s00[k] >= 0.0 and s11[k] >= 0.0
+        x00, x11 = max(s00[k], 0.0), max(s11[k], 0.0)
+        area = max(x00 * x11 - s01[k] * s01[k], 0.0)
+        across = x11 * r0[k] * r0[k] + x00 * r1[k] * r1[k] - 2.0 * s01[k] * r0[k] * r1[k]
+        det = 1.0 + x00 + x11 + area
+        m2 = (r0[k] * r0[k] + r1[k] * r1[k] + max(across, 0.0)) / det
+        density = good * expected_density(m2, dof) / math.sqrt(det)
         log_weight[k] += math.log((density + bad) / unchanged)
         largest = max(largest, log_weight[k])
+        # gain (I / rho + S)^-1, left in s; none where rounding has used the variance up
         rho = density / (density + bad)
-        # gain (I / rho + S)^-1, left in s
-        v00, v11, v01 = 1.0 + rho * s00[k], 1.0 + rho * s11[k], rho * s01[k]
-        scale = rho / (v00 * v11 - v01 * v01)
-        s00[k], s01[k], s11[k] = scale * v11, -scale * v01, scale * v00
+        scale = rho / (1.0 + rho * (x00 + x11 + rho * area)) if sound else 0.0
+        s00[k], s11[k] = scale * (1.0 + rho * x11), scale * (1.0 + rho * x00)
+        s01[k] *= -scale * rho
     for i in range(size):
         for k in range(used):
             x0 = s00[k] * a[i, k] + s01[k] * b[i, k]
@@ -333,12 +283,12 @@ def look(watch, looks, log_threshold, out):
 
         row = recent[number % len(recent)]
         row[0], row[1], row[2], row[3] = probability, camera, laser, plane
-        _count_outlier(watch.outliers, probability)
+        count_outlier(watch.outliers, probability)
         if number >= LAG:
             row = recent[(number - LAG) % len(recent)]
-            _count_outlier(cameras.outliers[int(row[1])], row[0])
-            _count_outlier(lasers.outliers[int(row[2])], row[0])
-            _count_outlier(planes.outliers[int(row[3])], row[0])
+            count_outlier(cameras.outliers[int(row[1])], row[0])
+            count_outlier(lasers.outliers[int(row[2])], row[0])
+            count_outlier(planes.outliers[int(row[3])], row[0])
         watch.number[0] = number + 1
 
         total = _log_sum(watch.spread[:, 0], -np.inf)

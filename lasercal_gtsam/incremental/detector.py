@@ -18,15 +18,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from lasercal_factors import change_kernels as kernels
 from lasercal_factors.change_arrays import LAG, Bank, Looks, Watch
+from lasercal_factors.change_rates import overall_rate
 
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.incremental.detector_state import (
     KINDS,
     covering,
@@ -35,67 +35,11 @@ from lasercal_gtsam.incremental.detector_state import (
     from_arrays,
     to_arrays,
 )
+from lasercal_gtsam.incremental.looks import Look, Onset, Verdict, plain, single
+
+__all__ = ["DEFAULT_THRESHOLD", "Detector", "Look", "Looks", "Onset", "Verdict"]
 
 DEFAULT_THRESHOLD = 100_000.0
-
-
-class Look(NamedTuple):
-    """A spot as it came, compared with what was expected before it was used.
-
-    Attributes
-    ----------
-    e : (2,) whitened innovation, identity covariance where nothing has changed; NaN where the
-        estimate says that no spot should be
-    camera, laser, plane : indices of the parts
-    by_camera : (2, 6) whitened derivative of the pixel by rotation (rad) and translation (m)
-    by_laser : (2, 4) by slopes (rad) and offsets (m)
-    by_plane : (2, 3) by tilt (rad) and distance (m)
-    area : of the picture in whitened units: width * height / sqrt(det covariance)
-    dof : degrees of freedom of the noise scale; inf where the noise is known
-    """
-
-    e: npt.ArrayLike
-    camera: int
-    laser: int
-    plane: int
-    by_camera: npt.ArrayLike
-    by_laser: npt.ArrayLike
-    by_plane: npt.ArrayLike
-    area: float
-    dof: float
-
-
-class Verdict(NamedTuple):
-    """What a spot says.
-
-    Attributes
-    ----------
-    outlier : more probably a gross outlier than a good spot of an unchanged cell
-    reason : why, with its length and the limit; "" for a good spot
-    alarm : something has changed
-    since : number of the first spot that is affected, counted from the detector's start at 0; None
-        without an alarm
-    statistic : evidence for a change, as a fraction of the threshold on a logarithmic scale: alarm
-        at 1
-    length, limit : of the innovation (sigma) and from which on a spot is an outlier
-    """
-
-    outlier: bool
-    reason: str
-    alarm: bool
-    since: int | None
-    statistic: float
-    length: float
-    limit: float
-
-
-class Onset(NamedTuple):
-    """A cause and a spot it may have begun with: kind, index, first spot, log weight."""
-
-    kind: str
-    part: int
-    first: int
-    log_weight: float
 
 
 @dataclass
@@ -151,7 +95,7 @@ class Detector:
     @property
     def outlier_rate(self) -> float:
         """Running rate of outliers over all parts."""
-        return float(kernels.overall_rate(self.watch.outliers))
+        return float(overall_rate(self.watch.outliers))
 
     def cover(self, cameras: int, lasers: int, planes: int) -> None:
         """Make room for at least so many parts; new ones start with nothing seen."""
@@ -189,11 +133,11 @@ class Detector:
         DataError
             Shapes, indices or numbers that cannot be.
         """
-        return self.look_many(_looks(spot))[0]
+        return self.look_many(single(spot))[0]
 
     def look_many(self, looks: Looks) -> list[Verdict]:
         """Take in spots in order, up to the first alarm: may return fewer verdicts than spots."""
-        looks = _plain(looks)
+        looks = plain(looks)
         out = np.empty((len(looks.e), 4))
         log_threshold = math.log(self.threshold)
         count = kernels.look(self.watch, looks, log_threshold, out)
@@ -299,33 +243,3 @@ class Detector:
                 counts = getattr(watch, kind).outliers[int(p)]
                 counts[0] = max(counts[0] - probability, 0.0)
             watch.recent[i % len(watch.recent), 0] = 0.0
-
-
-def _plain(looks: Looks) -> Looks:
-    """Arrays of the types that are compiled for."""
-    return Looks(
-        np.ascontiguousarray(looks.e, dtype=np.float64),
-        np.ascontiguousarray(looks.who, dtype=np.int64),
-        np.ascontiguousarray(looks.by_camera, dtype=np.float64),
-        np.ascontiguousarray(looks.by_laser, dtype=np.float64),
-        np.ascontiguousarray(looks.by_plane, dtype=np.float64),
-        np.ascontiguousarray(looks.area, dtype=np.float64),
-        np.ascontiguousarray(looks.dof, dtype=np.float64),
-    )
-
-
-def _looks(spot: Look) -> Looks:
-    """One spot as arrays."""
-
-    def one(value: npt.ArrayLike) -> Array:
-        return np.asarray(value, dtype=np.float64)[None]
-
-    return Looks(
-        one(spot.e),
-        np.array([[spot.camera, spot.laser, spot.plane]], dtype=np.int64),
-        one(spot.by_camera),
-        one(spot.by_laser),
-        one(spot.by_plane),
-        np.array([spot.area], dtype=np.float64),
-        np.array([spot.dof], dtype=np.float64),
-    )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lasercal_factors import change_densities, change_kernels
+from lasercal_factors import change_densities, change_kernels, change_rates
 from lasercal_factors.change_arrays import SLOTS, WINDOW
 from scipy import stats
 
@@ -116,7 +116,7 @@ def test_statistic_grows_by_one_a_good_spot_on_average(
     assert detector.watch.cameras.used.max() == SLOTS
     watch, plane = detector.watch, pool.plane[17]
     parts = watch.cameras.outliers[0], watch.lasers.outliers[0], watch.planes.outliers[plane]
-    eps = change_kernels.outlier_rate(watch.outliers, *parts)
+    eps = change_rates.outlier_rate(watch.outliers, *parts)
 
     def mean_and_error(e: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
         looks = study.looks_of(pool, np.full(len(e), 17), e, dof)
@@ -156,6 +156,22 @@ def test_old_onsets_are_merged_and_forgotten(pool: study.Pool) -> None:
         assert np.max(ages[:-1] / ages[1:]) <= 2.0
     number = detector.number
     assert bank.first[0, 0, bank.used[0, 0] - 1] == number - 1
+
+
+@pytest.mark.parametrize("sigma_px", [0.02, 5e-5])
+def test_precise_pixels_keep_the_numbers_sound(sigma_px: float) -> None:
+    """Information far beyond the prior's: rounding must not make evidence, nor hide a change."""
+    precise = study.make_pool(2, sigma_px)
+    detector = Detector.start(1, 1, 3, good=600)
+    assert len(detector.look_many(good_looks(precise, 3000, 18))) == 3000
+    for bank in (detector.watch.cameras, detector.watch.lasers, detector.watch.planes):
+        assert np.isfinite(bank.log_total).all()
+        assert np.isfinite(bank.mean).all()
+        assert np.isfinite(bank.cov).all()
+    index = np.arange(20)
+    looks = study.looks_of(precise, index, np.zeros((20, 2)))
+    turned = looks._replace(e=looks.by_camera[:, :, 0] * sigma_px * 0.06)
+    assert detector.look_many(turned)[-1].alarm
 
 
 # --- false alarms ------------------------------------------------------------------------------
