@@ -11,11 +11,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lasercal_gtsam.cli.live import Screen, alarm_words, sigma_words, spot_document, state_words
+from lasercal_gtsam.cli.live import (
+    Screen,
+    alarm_words,
+    moved_part,
+    sigma_words,
+    spot_document,
+    state_words,
+)
 from lasercal_gtsam.cli.texts import count
 from lasercal_gtsam.errors import DataError, LasercalError
 from lasercal_gtsam.io.calibration_file import save_calibration
-from lasercal_gtsam.io.history_file import history_path, write_history
+from lasercal_gtsam.io.history_file import history_path, up_to_now, write_history
 from lasercal_gtsam.io.plain import plain
 
 if TYPE_CHECKING:
@@ -93,7 +100,7 @@ class Keeper:
             if self._conversation or self._as_json:
                 self.print(spot_document(name, answer))
             self.said(answer)
-            self.save_if_due()
+            self.save(now=False)
 
     def said(self, update: Update) -> None:
         """Say what happened in an update, and remember to save it."""
@@ -118,10 +125,10 @@ class Keeper:
         if alarm is None:
             self._alarm = None
             return
-        cause = (alarm.cause.kind, alarm.cause.name) if alarm.causes else ()
-        if self._alarm == (alarm.since, *cause):
+        what = (alarm.since, alarm.causes and alarm.cause.kind, moved_part(alarm))
+        if self._alarm == what:
             return
-        self._alarm = (alarm.since, *cause)
+        self._alarm = what
         self._dirty = True
         words = alarm_words(alarm, _HOW[self._conversation])
         self.screen.line(click.style(f"Alarm: {words}", fg=_RED))
@@ -152,22 +159,23 @@ class Keeper:
             self.screen.warn(f"Warning: {notice.words}")
 
     def idle(self, waiting: Mapping[str, str]) -> None:
-        """Let the live line say what is waited for, where nothing else has been said yet."""
-        if self.screen.live and self.session.calibrator.n_spots == self._began and waiting:
+        """Nothing to do: save if that is due, and bring the live line up to date."""
+        self.save(now=False)
+        if waiting and self.session.calibrator.n_spots == self._began:
             name, why = next(iter(waiting.items()))
             self.screen.status(f"waiting: {name}: {why}")
+        self.screen.refresh()
 
     def print(self, document: Mapping[str, Any]) -> None:
         """One line of JSON on stdout, at once."""
         click.echo(json.dumps(plain(document), ensure_ascii=False, allow_nan=False))
         sys.stdout.flush()
 
-    def save_if_due(self) -> None:
-        """Save, unless that was done a moment ago."""
-        self.save(now=False)
-
     def save(self, now: bool) -> None:
-        """Write result and history; a full disk is said once, and tried again."""
+        """Write result and history, unless that was done a moment ago (or ``now``).
+
+        A full disk is said once, and tried again.
+        """
         since = time.monotonic() - self._saved
         if not self._dirty or not (now or since > max(_SAVE_S, _SAVE_SHARE * self._cost)):
             return
@@ -187,7 +195,8 @@ class Keeper:
         result = calibrator.calibration
         if result is not None:
             save_calibration(result, self._target, sources=self._sources)
-            write_history(history_path(self._target), [*self._earlier, *calibrator.history])
+            rows = up_to_now(calibrator.history, calibrator.n_spots, result)
+            write_history(history_path(self._target), [*self._earlier, *rows])
         self._dirty, self._said_unsaved = False, False
         self._saved = time.monotonic()
         self._cost = self._saved - began

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _REDRAW_S = 0.1
+# probability from which on a cause is acted on
+_CERTAIN = 0.95
 
 
 class Stopper:
@@ -67,32 +69,8 @@ class Screen:
     def __init__(self, err: bool = False) -> None:
         self.live = sys.stderr.isatty()
         self._err = err
-        self._status = ""
+        self._status, self._shown = "", ""
         self._drawn = 0.0
-
-    def line(self, text: str) -> None:
-        """A line that stays."""
-        self._wipe()
-        click.echo(text, err=self._err)
-        self._draw()
-
-    def warn(self, text: str) -> None:
-        """A line that stays, on stderr."""
-        self._wipe()
-        click.echo(text, err=True)
-        self._draw()
-
-    def status(self, text: str, now: bool = False) -> None:
-        """Let the live line say this; it is drawn at most every tenth of a second."""
-        self._status = text
-        if self.live and (now or time.monotonic() - self._drawn > _REDRAW_S):
-            self._wipe()
-            self._draw()
-
-    def close(self) -> None:
-        """Remove the live line."""
-        self._wipe()
-        self._status = ""
 
     def __enter__(self) -> Self:
         return self
@@ -100,17 +78,43 @@ class Screen:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _wipe(self) -> None:
-        if self.live and self._status:
-            click.echo("\r\x1b[K", nl=False, err=True)
+    def line(self, text: str) -> None:
+        """A line that stays."""
+        self._wipe()
+        click.echo(text, err=self._err)
 
-    def _draw(self) -> None:
-        if self.live and self._status:
-            width = shutil.get_terminal_size().columns - 1
-            text = self._status if len(click.unstyle(self._status)) <= width else ""
-            click.echo(text or click.unstyle(self._status)[:width], nl=False, err=True)
+    def warn(self, text: str) -> None:
+        """A line that stays, on stderr."""
+        self._wipe()
+        click.echo(text, err=True)
+
+    def status(self, text: str) -> None:
+        """Let the live line say this; it is drawn at most every tenth of a second."""
+        self._status = text
+        if time.monotonic() - self._drawn > _REDRAW_S:
+            self.refresh()
+
+    def refresh(self) -> None:
+        """Draw the live line as it should be."""
+        if not self.live or self._shown == self._status:
+            return
+        self._wipe()
+        width = shutil.get_terminal_size().columns - 1
+        plain = click.unstyle(self._status)
+        click.echo(self._status if len(plain) <= width else plain[:width], nl=False, err=True)
+        sys.stderr.flush()
+        self._shown, self._drawn = self._status, time.monotonic()
+
+    def close(self) -> None:
+        """Remove the live line."""
+        self._wipe()
+        self._status = ""
+
+    def _wipe(self) -> None:
+        if self._shown:
+            click.echo("\r\x1b[K", nl=False, err=True)
             sys.stderr.flush()
-            self._drawn = time.monotonic()
+            self._shown = ""
 
 
 # --- words --------------------------------------------------------------------------------------
@@ -154,14 +158,18 @@ def state_words(update: Update) -> str:
     return ", ".join(parts)
 
 
+def moved_part(alarm: Alarm) -> tuple[str, str] | None:
+    """What has moved, kind and name, where that is as good as certain."""
+    if not alarm.causes or alarm.cause.kind not in ("camera", "laser", "plane"):
+        return None
+    return (alarm.cause.kind, alarm.cause.name) if alarm.cause.probability > _CERTAIN else None
+
+
 def alarm_words(alarm: Alarm, how: str) -> str:
-    """An alarm, and what to do about it; ``how`` has a place {part} for what has moved."""
-    if not alarm.causes:
-        return f"{alarm.words or 'something has changed'}; more spots will tell what"
-    cause = alarm.cause
-    if cause.kind not in ("camera", "laser", "plane"):
-        return alarm.words
-    return f"{alarm.words}. {how.format(part=cause.kind, name=cause.name)}"
+    """An alarm, and what to do about it; ``how`` has places {part}, {name} for what has moved."""
+    part = moved_part(alarm)
+    words = alarm.words or "something has changed; more spots will tell what"
+    return f"{words}. {how.format(part=part[0], name=part[1])}" if part else words
 
 
 def update_document(update: Update) -> dict[str, Any]:

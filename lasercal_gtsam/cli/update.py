@@ -43,7 +43,7 @@ class _Outcome:
     events: tuple[Event, ...]
     alarm: Alarm | None
     missing: tuple[str, ...]
-    history: tuple[HistoryRow, ...]
+    history: list[HistoryRow]
 
     @property
     def rejected(self) -> dict[str, str]:
@@ -195,6 +195,7 @@ def _update(
 ) -> _Outcome:
     """Take the spots one by one, as they would have come."""
     from lasercal_gtsam.incremental import IncrementalCalibrator
+    from lasercal_gtsam.io.history_file import up_to_now
 
     calibrator = IncrementalCalibrator(before, automatic=automatic)
     begun = len(calibrator.events)
@@ -212,7 +213,7 @@ def _update(
         events=calibrator.events[begun:],
         alarm=calibrator.alarm,
         missing=tuple(missing.words for missing in calibrator.missing),
-        history=calibrator.history,
+        history=up_to_now(calibrator.history, calibrator.n_spots, after),
     )
 
 
@@ -222,7 +223,7 @@ def _save(outcome: _Outcome, target: Path, calibration: Path, capture: Capture) 
     from lasercal_gtsam.io.history_file import earlier_rows, history_path, write_history
 
     rows = outcome.history
-    earlier = earlier_rows(history_path(calibration), rows[0].spots) if rows else ()
+    earlier = earlier_rows(history_path(calibration), rows[0].spots)
     sources = {calibration.name: sha256_of(calibration), **capture.provenance}
     save_calibration(outcome.after, target, sources=sources)
     write_history(history_path(target), [*earlier, *rows])
@@ -272,17 +273,21 @@ def change_table(before: Calibration, after: Calibration) -> str:
 
 def _complaints(outcome: _Outcome, calibration: Path, capture: Path, written: str) -> list[str]:
     """Why the answer cannot be trusted, and what to type next."""
+    from lasercal_gtsam.cli.live import moved_part
+
     lines = []
     if outcome.alarm is not None:
-        cause = outcome.alarm.cause if outcome.alarm.causes else None
         lines.append(f"{outcome.alarm.words or 'something has changed'}; {written}")
-        if cause is not None and cause.kind in ("camera", "laser", "plane"):
+        if part := moved_part(outcome.alarm):
             lines.append(
-                f"if the {cause.kind} was moved: lasercal update {calibration} {capture} "
-                f"--reset {cause.kind}:{cause.name}"
+                f"if the {part[0]} was moved: lasercal update {calibration} {capture} "
+                f"--reset {part[0]}:{part[1]}"
             )
         else:
-            lines.append(f"look at the spots since {outcome.alarm.since}, then calibrate anew")
+            lines.append(
+                f"look at the spots since {outcome.alarm.since}; with more of them, over all "
+                "planes, the cause can be told"
+            )
     if outcome.missing:
         lines += [f"{words}; {written}" for words in outcome.missing]
         lines.append("add such spots to the capture, and give all of them in one update")

@@ -291,10 +291,9 @@ def _follow(
             if stop.asked:
                 return False, {}
         first = False
-        keeper.save_if_due()
+        keeper.idle(follower.waiting)
         if limit is not None and not follower.soon and time.monotonic() - last >= limit:
             return True, follower.waiting
-        keeper.idle(follower.waiting)
         stop.wait(interval)
     return False, follower.waiting
 
@@ -318,7 +317,7 @@ def _listen(keeper: Keeper, said: _Head | None, stop: Stopper, limit: float | No
         if got:
             answers.take(got)
             last = time.monotonic()
-        keeper.save_if_due()
+        keeper.idle({})
         if limit is not None and time.monotonic() - last > limit:
             return True
     return not stop.asked

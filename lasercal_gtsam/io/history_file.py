@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from lasercal_gtsam.calibration import Parameter
+from lasercal_gtsam.calibration import Calibration, Parameter
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.history import HistoryRow
 from lasercal_gtsam.io.files import read_text, write_text
@@ -87,6 +87,14 @@ def earlier_rows(path: Path, spots: int) -> tuple[HistoryRow, ...]:
     """
     rows = read_history(path) if path.exists() else ()
     return tuple(row for row in rows if row.spots < spots)
+
+
+def up_to_now(rows: Sequence[HistoryRow], spots: int, calibration: Calibration) -> list[HistoryRow]:
+    """The rows, and one more for the state now where the last one is older: rows are thinned."""
+    if rows and rows[-1].spots >= spots:
+        return list(rows)
+    fit = calibration.fit
+    return [*rows, HistoryRow(spots, fit.rms_px, fit.sigma0, calibration.parameters)]
 
 
 def read_history(path: str | Path) -> tuple[HistoryRow, ...]:
