@@ -73,7 +73,10 @@ def _turn_words(degrees: float) -> str:
 
 def _plane_words(cell: Cell, degrees: float) -> str:
     against = "the one there is" if len(cell.planes) == 1 else "those there are"
-    return f"add a plane tilted by {degrees:g} deg or more against {against}, with {SHOTS} shots"
+    return (
+        f"add a plane tilted by {degrees:g} deg or more against {against}, with {SHOTS} shots in "
+        "as many hand orientations"
+    )
 
 
 def _kept(kind: Kind, words: str, cell: Cell, shots: Observations) -> Iterator[Remedy]:

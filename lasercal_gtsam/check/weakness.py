@@ -7,6 +7,7 @@ add along just that direction, computed at the estimate.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,8 +28,10 @@ from lasercal_gtsam.solve import fold_warnings
 
 Mask = npt.NDArray[np.bool_]
 
-CURED = 1.2 * WEAK
-"""Strength that a remedy must reach: a little more than what counts as weak."""
+POOR = 0.8 * WEAK
+"""Strength below which the geometry is called weak; the paper's own smallest tests lie above."""
+CURED = 1.5 * WEAK
+"""Strength that a remedy must reach: with a margin, for the estimate is not exact."""
 _EXACT_PX = 1e-6
 _SHARE = 0.12
 _MOST_NAMED = 3
@@ -100,7 +103,7 @@ def weaknesses(calibration: Calibration) -> tuple[Weakness, ...]:
         held=held
         | {label for label in calibration.labels if label.rpartition(".")[2] in DISTORTION_NAMES},
     )
-    return (*rigid.weaknesses(distortion=False), *_beyond(bench, rigid))
+    return (*rigid.weaknesses(POOR, distortion=False), *_beyond(bench, rigid))
 
 
 def _beyond(bench: _Bench, rigid: _Bench) -> tuple[Weakness, ...]:
@@ -108,7 +111,7 @@ def _beyond(bench: _Bench, rigid: _Bench) -> tuple[Weakness, ...]:
     if rigid.held == bench.held:
         return ()
     count = len(rigid.svd().weak_directions(WEAK))
-    return bench.weaknesses(distortion=True)[count:]
+    return bench.weaknesses(WEAK, distortion=True)[count:]
 
 
 def _ordered(cell: Cell, observations: Observations) -> Cell:
@@ -179,32 +182,28 @@ class _Bench:
         spread = (svd.directions @ d) / np.maximum(svd.values, 1e-12)
         return float(1.0 / np.linalg.norm(spread))
 
-    def weaknesses(self, distortion: bool) -> tuple[Weakness, ...]:
+    def weaknesses(self, threshold: float, distortion: bool) -> tuple[Weakness, ...]:
+        """Directions with a strength below the threshold, weakest first, with their cures."""
         svd = self.svd()
-        weak = svd.weak_directions(WEAK)
+        weak = svd.weak_directions(threshold)
         if not weak:
             return ()
-        tried = [
-            (remedy, self.with_more(remedy))
-            for remedy in remedies(_without_folds(self.cell), self.observations)
-        ]
+        tried: dict[str, tuple[str, list[_Bench]]] = {}
+        for remedy in remedies(_without_folds(self.cell), self.observations):
+            tried.setdefault(remedy.words, (remedy.kind, []))[1].append(self.with_more(remedy))
         causes = causes_of(self.cell, self.observations)
         found = []
         for rank, direction in enumerate(weak):
             move = svd.directions[len(svd.labels) - 1 - rank]
-            cures = [
-                Cure(
-                    remedy.kind,
-                    causes[remedy.kind].words,
-                    remedy.words,
-                    bench.strength(svd.labels, move),
-                )
-                for remedy, bench in tried
-            ]
+            cures = list[Cure]()
+            for words, (kind, benches) in tried.items():
+                # whatever the advice leaves open must not matter: the worst way counts
+                worst = min(bench.strength(svd.labels, move) for bench in benches)
+                cures.append(Cure(kind, causes[kind].words, words, worst))
             # as many shots again double the information
             again = f"add {len(self.observations)} shots like those there are"
             cures.append(
-                Cure("repeat", causes["repeat"].words, again, np.sqrt(2.0) * direction.strength)
+                Cure("repeat", causes["repeat"].words, again, math.sqrt(2.0) * direction.strength)
             )
             found.append(
                 Weakness(
