@@ -8,6 +8,9 @@ rate", summed over the possible onsets: the statistic of Shiryaev (1963) and Rob
 alarm is raised where it reaches the threshold, which is then a lower bound for the mean number of
 good spots between false alarms (Pollak 1985); see `lasercal_factors.change_kernels`.
 
+The bound is exact where outliers come one by one, at the rate that is estimated, as likely anywhere
+in the picture or crowded about the spot; ghosts that all lie at one offset look like a moved part.
+
 A sluggish calibrator absorbs part of a lasting change; the ratios neglect that (Willsky and Jones
 1976 do not), which costs power for changes that need about as many spots as there were before, and
 never a false alarm.

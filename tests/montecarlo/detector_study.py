@@ -5,7 +5,7 @@ cell, innovations whitened with pixel noise and with the uncertainty left by `be
 spots are drawn as what they are in a linear model, independent normal vectors; moved parts by
 projecting through the moved cell.
 
-    python tests/montecarlo/detector_study.py            # everything, about ten minutes
+    python tests/montecarlo/detector_study.py            # everything, about five minutes
 """
 
 from __future__ import annotations
