@@ -208,7 +208,7 @@ def _open(
     from lasercal_gtsam.incremental.journaled import JournaledCalibrator
 
     check_writable(journal)
-    if journal.exists():
+    if _is_begun(journal):
         if start is not None and start.resolve() == target.resolve():
             start = None  # it has become the result; the journal keeps a copy
     elif start is None and target.exists():
@@ -228,6 +228,15 @@ def _open(
         session.close()
         raise
     return session
+
+
+def _is_begun(journal: Path) -> bool:
+    """Whether there is a journal; its first line may never have been finished."""
+    try:
+        with journal.open("rb") as file:
+            return b"\n" in file.read(1 << 16)
+    except OSError:
+        return False
 
 
 def _sources(said: _Head | None, start: Path | None) -> dict[str, str]:

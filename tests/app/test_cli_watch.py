@@ -218,7 +218,10 @@ def feed_with_kills(growing, rows, kills: int, seed: int) -> set[str]:
 
 
 def journalled_so_far(folder: Path) -> list[str]:
-    return journalled(folder) if (folder / "calibration.journal.jsonl").exists() else []
+    try:
+        return journalled(folder)
+    except lc.DataError:  # not there, or its first line is not finished
+        return []
 
 
 def test_killed_at_random_moments_nothing_is_lost(lasercal, growing, rows):
@@ -371,6 +374,26 @@ def test_ids_of_another_capture_need_a_prefix(lasercal, growing, tmp_path):
     assert "--prefix" in outcome.err
     assert lasercal("watch", other, *begin, "--prefix", "tue-").status == 0
     assert journalled(other) == [f"tue-{name}" for name in again.id.tolist()]
+
+
+def test_killed_while_the_journal_was_begun(lasercal, growing, rows):
+    append(growing, *rows[START + 1 : START + 3])
+    result = growing / "calibration.json"
+    start().save(result)
+    args = ("watch", growing, "--calibration", result, "--once", "--interval", "0.01")
+    assert lasercal(*args).status == 0
+    journal = growing / "calibration.journal.jsonl"
+    header, first, _ = journal.read_bytes().splitlines(keepends=True)
+    for left, taken in ((b"", 2), (header[:70], 2), (header, 2), (header + first[:30], 2)):
+        start().save(result)
+        journal.write_bytes(left)
+        outcome = lasercal(*args)
+        assert outcome.status == 0, outcome.err
+        assert f"Ended: {taken} spots taken, {START + 2} in all." in outcome.out
+        assert outcome.err.count("\n") == (0 if left in (b"", header) else 1)
+    start().save(result)
+    journal.write_bytes(header + first)
+    assert f"Ended: 1 spot taken, {START + 2} in all." in lasercal(*args).out
 
 
 def test_wrong_columns_at_the_start_are_an_error(lasercal, growing):
