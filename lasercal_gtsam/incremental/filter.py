@@ -11,7 +11,6 @@ that made things worse is taken back, and a damped solution takes over.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -33,13 +32,13 @@ from lasercal_gtsam.incremental.belief import (
     marginalised,
 )
 from lasercal_gtsam.incremental.innovation import Innovation
+from lasercal_gtsam.incremental.soft_priors import Priors, soft_priors
 from lasercal_gtsam.incremental.store import SpotStore
 from lasercal_gtsam.robust import rejection_length
 
 Mask = npt.NDArray[np.bool_]
 Marks = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
-Prior = Callable[[Array], Array]
 
 # spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
 SLICE, SLICE_HAND = 600, 200
@@ -180,7 +179,7 @@ class Filter:
     aspects : tied ``fu / fv`` for each camera, or None
     prior : (n+1, n+1) quadratic about the chart's origin, in a-priori sigmas: older spots, or a
         calibration; ``prior_rows``: how many residuals are behind its corner
-    soft : priors that are not quadratic: coordinates to their augmented information, as ``prior``
+    priors : on rows of the table: name to (mean, sigma) in the table's units
     weighing : noise of the hand, and fading
     start : where to begin (n,); the reference if left out
     scale : a-posteriori scale to begin with
@@ -198,7 +197,7 @@ class Filter:
         *,
         prior: Array | None = None,
         prior_rows: float = 0.0,
-        soft: Prior | None = None,
+        priors: Priors | None = None,
         weighing: Weighing | None = None,
         start: Array | None = None,
         scale: float = 1.0,
@@ -214,7 +213,8 @@ class Filter:
         self.weighing = weighing or Weighing(np.zeros(6), 1.0)
         self.prior = np.zeros((n + 1, n + 1)) if prior is None else prior
         self.prior_rows = prior_rows
-        self._soft = soft
+        self.priors = priors or {}
+        self._soft = soft_priors(self.chart, cell, held, self.priors)
         tied = np.flatnonzero(~np.isnan(self.chart.aspect_array))
         self._ties = (15 * tied + 6, 15 * tied + 7, self.chart.aspect_array[tied])
         self._slice = SLICE_HAND if np.any(self.weighing.hand > 0) else SLICE

@@ -1,78 +1,151 @@
-"""Cells with a part more, less or elsewhere, and what is known of them beforehand."""
+"""Parts that are new, or that were moved: found from their spots and taken into the estimate."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
-from lasercal_factors.chart import CellChart
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
-from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CELL_KEY, prior_factor, state_from_cell
-from lasercal_gtsam.holds import Holds
-from lasercal_gtsam.incremental.belief import Mask, Part
-from lasercal_gtsam.incremental.relocate import locate_camera, locate_laser, locate_plane
+from lasercal_gtsam.incremental.beginning import holds_of
+from lasercal_gtsam.incremental.belief import Mask, Part, part_offset
+from lasercal_gtsam.incremental.filter import Filter
+from lasercal_gtsam.incremental.relocate import (
+    locate_camera,
+    locate_laser,
+    locate_plane,
+    missing_for,
+)
+from lasercal_gtsam.incremental.update import Missing
 from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import DISTORTION_NAMES, CalibrationOptions
+from lasercal_gtsam.report_map import CAMERA_TANGENT, tangent_labels
 
 KINDS: tuple[Part, ...] = ("camera", "laser", "plane")
+# coordinates that a move changes: of a camera its pose
+MOVABLE: dict[Part, int] = {"camera": 6, "laser": 4, "plane": 3}
+Named = tuple[Part, str]
 
 
-def with_part(cell: Cell, kind: Part, name: str, part: Camera | Beam | Plane) -> Cell:
+def parts_of(cell: Cell, kind: Part) -> dict[str, Camera] | dict[str, Beam] | dict[str, Plane]:
+    """The cell's parts of one kind, by name."""
+    found: dict[str, Camera] | dict[str, Beam] | dict[str, Plane] = getattr(cell, f"{kind}s")
+    return found
+
+
+def with_part(cell: Cell, part: Named, value: Camera | Beam | Plane) -> Cell:
     """The cell with that part in it, in its old place or at the end."""
-    return replace(cell, **{f"{kind}s": {**getattr(cell, f"{kind}s"), name: part}})
+    kind, name = part
+    changed: dict[str, Any] = {f"{kind}s": {**parts_of(cell, kind), name: value}}
+    return replace(cell, **changed)
 
 
-def without_parts(cell: Cell, parts: Iterable[tuple[Part, str]]) -> Cell:
+def without_parts(cell: Cell, parts: Iterable[Named]) -> Cell:
     """The cell without those parts."""
     gone = set(parts)
-    kept = {
-        f"{kind}s": {
-            name: part
-            for name, part in getattr(cell, f"{kind}s").items()
-            if (kind, name) not in gone
-        }
-        for kind in KINDS
-    }
-    return Cell(**kept)
+    return Cell(
+        *(
+            {name: part for name, part in parts_of(cell, kind).items() if (kind, name) not in gone}
+            for kind in KINDS
+        )  # type: ignore[arg-type]
+    )
 
 
-def located(kind: Part, name: str, observations: Observations, cell: Cell) -> Camera | Beam | Plane:
+def determined(observations: Observations, cell: Cell, unknown: Iterable[Named] = ()) -> Mask:
+    """(N,) spots all of whose parts are in the cell and not unknown."""
+    good = np.ones(len(observations), np.bool_)
+    for kind in KINDS:
+        good &= np.isin(getattr(observations, kind), list(parts_of(cell, kind)))
+    for kind, name in unknown:
+        good &= getattr(observations, kind) != name
+    return good
+
+
+class Found(NamedTuple):
+    """A part where its spots say it is."""
+
+    part: Named
+    value: Camera | Beam | Plane
+
+
+def find_part(
+    cell: Cell, unknown: list[Named], waiting: Observations | None
+) -> Found | list[Missing]:
+    """The first of the unknown parts that the waiting spots determine, else all that is missing."""
+    missing: list[Missing] = []
+    for part in unknown:
+        kind, name = part
+        known = without_parts(cell, [other for other in unknown if other != part])
+        if waiting is None:
+            words = f"{kind} {name!r} was freed and has no spots yet"
+            missing.append(Missing(kind, name, 0, MOVABLE[kind], words))
+            continue
+        lacking = missing_for(kind, name, waiting, known)
+        if not lacking:
+            return Found(part, _located(part, waiting, known))
+        missing += lacking
+    return missing
+
+
+def relaid(
+    old: Filter, cell: Cell, part: Named, options: CalibrationOptions
+) -> tuple[Filter, tuple[str, ...] | None]:
+    """The same knowledge in the chart of a cell with a part more, or with one elsewhere.
+
+    ``cell`` is the old filter's template with the part put in. Also what is held then, in words,
+    where that has changed: assumptions for a camera that saw one plane go with the second.
+    """
+    kind, name = part
+    labels = tangent_labels(cell)
+    where = {label: i for i, label in enumerate(labels)}
+    columns = np.array([where[label] for label in tangent_labels(old.template)])
+    n, everything = len(labels), np.append(columns, len(labels))
+    prior, start = np.zeros((n + 1, n + 1)), np.zeros(n)
+    prior[np.ix_(everything, everything)] = old.prior
+    held, still_open = np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+    start[columns], held[columns], still_open[columns] = old.z, old.held, old.open
+    at = part_offset(cell, kind, name)
+    found = slice(at, at + MOVABLE[kind])
+    start[found], still_open[found] = 0.0, False
+    holds = holds_of(old.store, options, cell)
+    priors, words = old.priors, None
+    if not old.prior_rows:
+        lens = np.array([label.rpartition(".")[2] in DISTORTION_NAMES for label in labels])
+        held = holds.held | (held & lens)
+        priors, words = holds.priors, holds.words
+    elif kind == "camera" and name not in old.template.cameras:
+        mine = slice(at, at + len(CAMERA_TANGENT))
+        held[mine] = holds.held[mine]
+    aspects = dict(zip(old.template.cameras, old.chart.aspects, strict=True))
+    new = Filter(
+        old.store,
+        cell,
+        held,
+        tuple(aspects.get(c, holds.aspect.get(c)) for c in cell.cameras),
+        prior=prior,
+        prior_rows=old.prior_rows,
+        priors=priors,
+        weighing=old.weighing,
+        start=start,
+        open=still_open,
+        end=old.end,
+        scale=old.scale,
+        robust=old.robust,
+    )
+    new.folded, new.fallbacks = old.folded, old.fallbacks
+    return new, words
+
+
+def _located(part: Named, waiting: Observations, cell: Cell) -> Camera | Beam | Plane:
     """The part from its spots whose other parts are in the cell (see `relocate`)."""
-    good = getattr(observations, kind) == name
+    kind, name = part
+    good = getattr(waiting, kind) == name
     for other in KINDS:
         if other != kind:
-            good &= np.isin(getattr(observations, other), list(getattr(cell, f"{other}s")))
-    spots = observations[good]
+            good &= np.isin(getattr(waiting, other), list(parts_of(cell, other)))
+    spots = waiting[good]
     if kind == "camera":
         return locate_camera(cell, spots)
     return locate_laser(cell, spots) if kind == "laser" else locate_plane(cell, spots)
-
-
-def soft_priors(
-    cell: Cell,
-    aspects: tuple[float | None, ...],
-    held: Mask,
-    priors: Mapping[str, tuple[float, float]],
-) -> Callable[[Array], Array] | None:
-    """Priors on rows of the table, as augmented information about a point of the cell's chart.
-
-    None where there are none. The function takes chart coordinates (n,) and gives
-    ``[J r]^T [J r]``, (n+1, n+1), at that point.
-    """
-    if not priors:
-        return None
-    chart = CellChart(state_from_cell(cell), aspects)
-    holds = Holds(held, {}, {}, frozenset(), dict(priors), ())
-    factor = prior_factor(chart, holds, cell)
-
-    def information(z: Array) -> Array:
-        values = gtsam.Values()
-        values.insert(CELL_KEY, z)
-        A, b = factor.linearize(values).jacobian()
-        rows = np.column_stack([A, -b])
-        return np.asarray(rows.T @ rows)
-
-    return information

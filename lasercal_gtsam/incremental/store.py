@@ -94,6 +94,11 @@ class SpotStore:
         parts = [s[2] for _, s in self.slices(self._from(begin), self._to(end))]
         return np.concatenate(parts) if parts else np.empty(0, np.uint8)
 
+    def path_numbers(self) -> npt.NDArray[np.int32]:
+        """Number of the path of each spot that is stored."""
+        parts = [s[1] for _, s in self.slices(self.first, self.end)]
+        return np.concatenate(parts) if parts else np.empty(0, np.int32)
+
     def record(self, number: int) -> tuple[Array, np.int32]:
         """The row of a spot, and the number of its path."""
         records, path, _ = self._segments[number // SEGMENT]
