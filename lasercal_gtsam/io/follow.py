@@ -8,6 +8,7 @@ something else after it was used is reported and stays as it was.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from lasercal_gtsam.io.capture_rows import USED, Rows, rows_of, spot_pixels
 from lasercal_gtsam.io.files import sha256_of
 from lasercal_gtsam.io.follow_pictures import Detector, Fault, PictureDesk, Wait
 from lasercal_gtsam.io.follow_tables import CaptureTables, NewRow, at_line
+from lasercal_gtsam.io.growing import Clock
 from lasercal_gtsam.io.known_spots import KnownSpots
 from lasercal_gtsam.io.tables import Row, Table
 from lasercal_gtsam.observations import Observations
@@ -74,6 +76,7 @@ class CaptureFollower:
     prefix : put before every id
     sigma_px : given to spots without a covariance of their own; None: they are left without
     detector : as in `Capture.detections`
+    clock : seconds, for how long files have not changed
 
     Attributes
     ----------
@@ -97,6 +100,7 @@ class CaptureFollower:
         prefix: str = "",
         sigma_px: float | None = None,
         detector: Detector | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
         self.path = capture_file(Path(path))
         self.head, _ = read_head(self.path)
@@ -108,10 +112,10 @@ class CaptureFollower:
         self._known, self._where, self._prefix = known, where, prefix
         self._sigma_px = sigma_px
         folder, name = self.path.parent, self.path.name
-        self._desk = (
-            PictureDesk(self.head, folder, name, detector) if self.head.images is not None else None
-        )
-        self._tables = CaptureTables(self.head, self.path)
+        self._desk = None
+        if self.head.images is not None:
+            self._desk = PictureDesk(self.head, folder, name, detector, clock)
+        self._tables = CaptureTables(self.head, self.path, clock)
         self._open: dict[str, _Open] = {}
         self._unjudged: dict[str, None] = {}
         self._pictured: dict[str, _Pictured] = {}

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from lasercal_gtsam.errors import DataError, DetectionError
 from lasercal_gtsam.io.capture_head import CaptureHead, ImagesHead
+from lasercal_gtsam.io.growing import Clock
 from lasercal_gtsam.io.pictures import PLACEHOLDERS, Picture, expand_pattern, read_picture
 from lasercal_gtsam.io.spot_account import FoundSpot
 from lasercal_gtsam.io.stand_in import MAX_PICTURES, MIN_ROWS, WITHOUT, Scene, evenly, median_of
@@ -16,11 +17,11 @@ from lasercal_gtsam.io.stand_in import MAX_PICTURES, MIN_ROWS, WITHOUT, Scene, e
 Detector = Callable[[Picture, Picture | None], FoundSpot]
 Names = Mapping[str, str]
 
-# Looks after which a picture that does not change counts as whole although it cannot be read, and
-# a laser-off picture as not taken.
-PATIENCE = 10
-# A file that old is not being written any more.
-_OLD_S = 5.0
+# A picture that has not changed for so long is whole, unless it cannot be read.
+_WHOLE_S = 0.3
+# One that has not changed for so long is not being written any more, whatever is wrong with it; and
+# a laser-off picture that has not come so long after the laser-on one does not come.
+PATIENCE_S = 5.0
 
 
 @dataclass(frozen=True)
@@ -47,18 +48,9 @@ class _File:
     """A file as it was when last looked at."""
 
     status: tuple[int, ...] = ()
-    looks: int = 0  # in a row in which it did not change
-    old: bool = False
+    since: float = 0.0  # time from which on it has been like this
     fault: str = ""
     seen: bool = False  # the fault is in what the picture shows
-
-    @property
-    def whole(self) -> bool:
-        return self.looks > 0 or self.old
-
-    @property
-    def final(self) -> bool:
-        return self.looks >= PATIENCE or self.old or self.seen
 
 
 @dataclass
@@ -95,6 +87,7 @@ class PictureDesk:
     ----------
     head, folder : of the capture
     place : what messages call ``capture.yaml``
+    clock : seconds, for how long files have not changed
     detector : ``(on, off or None) -> detection``; None: as in `Capture.detections`
 
     Raises
@@ -104,18 +97,23 @@ class PictureDesk:
     """
 
     def __init__(
-        self, head: CaptureHead, folder: Path, place: str, detector: Detector | None = None
+        self,
+        head: CaptureHead,
+        folder: Path,
+        place: str,
+        detector: Detector | None = None,
+        clock: Clock = time.monotonic,
     ) -> None:
         assert head.images is not None
         self._images = head.images
         self._folder = folder
         self._sizes = {camera.name: (camera.width, camera.height) for camera in head.camera}
-        self._detector = detector
+        self._detector, self._clock = detector, clock
         self._files: dict[Path, _File] = {}
         self._alone = head.images.off is None and head.images.background is None
         self._by_id = "{id}" in head.images.on
         self._scenes: dict[Scene, _Scene] = {}
-        self._without_off: dict[str, int] = {}
+        self._without_off: dict[str, float] = {}
         self._owner: dict[Path, str] = {}
         self._notes: list[str] = []
         _check_patterns(head.images, folder, place)
@@ -186,13 +184,17 @@ class PictureDesk:
             self._files.pop(path, None)
             return Wait(f"the {kind} {path} is not there yet")
         key = (status.st_ino, status.st_size, status.st_mtime_ns)
-        known = self._files.setdefault(path, _File())
-        if key == known.status:
-            known.looks += 1
-        else:
-            old = time.time() - status.st_mtime > _OLD_S
-            self._files[path] = known = _File(key, old=old)
-        return None if known.whole else Wait(f"the {kind} {path} is still being written", True)
+        known = self._files.get(path)
+        if known is None or known.status != key:
+            # a file from before this run need not be waited for
+            age = max(0.0, time.time() - status.st_mtime) if known is None else 0.0
+            self._files[path] = known = _File(key, self._clock() - age)
+        if self._age(path) >= _WHOLE_S:
+            return None
+        return Wait(f"the {kind} {path} is still being written", True)
+
+    def _age(self, path: Path) -> float:
+        return self._clock() - self._files[path].since
 
     def _off(self, names: Names, there: bool) -> Path | Wait:
         """Laser-off picture of a row; ``there``: its laser-on picture is."""
@@ -203,8 +205,10 @@ class PictureDesk:
             wait = self._not_whole(path, "laser-off picture")
             if wait is None:
                 return path
-            looks = self._without_off[names["id"]] = self._without_off.get(names["id"], 0) + there
-            if shared is None or path.exists() or looks <= PATIENCE:
+            if shared is None or path.exists() or not there:
+                return wait
+            since = self._without_off.setdefault(names["id"], self._clock())
+            if self._clock() - since < PATIENCE_S:
                 return wait
         assert shared is not None
         background = self._path(shared, names)
@@ -213,7 +217,8 @@ class PictureDesk:
     def _faulty(self, path: Path) -> Wait | Fault:
         """A picture that cannot be read may be one that is written slowly."""
         file = self._files[path]
-        return Fault(file.fault, file.seen) if file.final else Wait(file.fault)
+        final = file.seen or self._age(path) >= PATIENCE_S
+        return Fault(file.fault, file.seen) if final else Wait(file.fault)
 
     def _enough(self, names: Names, on: Path) -> Wait | None:
         """Whether there are pictures enough to make a laser-off picture of; counts this one."""

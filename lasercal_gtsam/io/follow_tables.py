@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,11 +11,11 @@ from typing import NamedTuple
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.capture_head import CaptureHead
 from lasercal_gtsam.io.capture_rows import rows_of
-from lasercal_gtsam.io.growing import GrowingTable
+from lasercal_gtsam.io.growing import Clock, GrowingTable
 from lasercal_gtsam.io.tables import Row, Table, table_of
 
-# Looks at an unchanged file after which a last line without line end is worth a word.
-PATIENCE = 10
+# Seconds without a change after which a last line without line end is worth a word.
+PATIENCE_S = 5.0
 
 
 class NewRow(NamedTuple):
@@ -56,13 +57,13 @@ class CaptureTables:
     usable : whether the headers say all that is needed
     """
 
-    def __init__(self, head: CaptureHead, path: Path) -> None:
+    def __init__(self, head: CaptureHead, path: Path, clock: Clock = time.monotonic) -> None:
         self.poses_file = head.poses.file
         self.spots_file = None if head.spots is None else head.spots.file
         self.usable = False
         self._head, self._name = head, path.name
         names = [self.poses_file, *([self.spots_file] if self.spots_file else [])]
-        self._files = {name: GrowingTable(path.parent / name) for name in names}
+        self._files = {name: GrowingTable(path.parent / name, clock) for name in names}
         self._headers: list[Row | None] = [None] * len(names)
 
     def read(self) -> News:
@@ -112,7 +113,7 @@ class CaptureTables:
     def unfinished(self) -> list[tuple[str, bool]]:
         """Files and lines that have no line end yet, and whether it is so for long."""
         return [
-            (f"{name}:{file.unfinished}", file.quiet >= PATIENCE)
+            (f"{name}:{file.unfinished}", file.quiet >= PATIENCE_S)
             for name, file in self._files.items()
             if file.exists and file.unfinished
         ]

@@ -7,11 +7,15 @@ cut or changed before its end is read again from the start.
 from __future__ import annotations
 
 import csv
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from lasercal_gtsam.io.files import reason_of
 from lasercal_gtsam.io.tables import Row
+
+Clock = Callable[[], float]
 
 # Bytes before the place where reading goes on that must still be the same.
 _OVERLAP = 4096
@@ -44,17 +48,16 @@ class GrowingTable:
     ----------
     header : line number and cells of the first line that is not blank; None until it is there
     unfinished : line number of a last line without line end, or 0
-    quiet : how often in a row the file was found unchanged
     exists : whether the file was there at the last look
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, clock: Clock = time.monotonic) -> None:
+        self.path, self._clock = path, clock
         self.header: Row | None = None
         self.unfinished = 0
-        self.quiet = 0
         self.exists = False
         self._seen: tuple[int, ...] | None = None
+        self._changed = clock()
         self._start_over()
 
     def read(self) -> Grown:
@@ -64,7 +67,6 @@ class GrowingTable:
             seen = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
             self.exists = True
             if seen == self._seen:
-                self.quiet += 1
                 return Grown()
             content, again = self._new_bytes(seen)
         except FileNotFoundError:
@@ -74,8 +76,13 @@ class GrowingTable:
         except OSError as error:
             self._seen = None
             return Grown(problems=((0, reason_of(error)),))
-        self._seen, self.quiet = seen, 0
+        self._seen, self._changed = seen, self._clock()
         return self._take(content, again)
+
+    @property
+    def quiet(self) -> float:
+        """Seconds since the file was seen to change."""
+        return self._clock() - self._changed
 
     def read_again(self) -> None:
         """Let the next look begin at the file's start."""

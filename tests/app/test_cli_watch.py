@@ -211,7 +211,8 @@ def feed_with_kills(growing, rows, kills: int, seed: int) -> set[str]:
                 time.sleep(float(rng.uniform(0, 0.3)))
             child.process.kill()
             out = child.got + child.process.stdout.read()
-        acknowledged |= {json.loads(line)["id"] for line in out.split(b"\n")[:-1]}
+        documents = [json.loads(line) for line in out.split(b"\n")[:-1]]
+        acknowledged |= {d["id"] for d in documents if "notice" not in d}
         assert acknowledged <= set(journalled_so_far(growing))
     append(growing, text[at:])
     return acknowledged

@@ -16,7 +16,7 @@ from detect_cases import ellipse
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.capture import load_capture
 from lasercal_gtsam.io.follow import BATCH, CaptureFollower, Notice
-from lasercal_gtsam.io.follow_pictures import PATIENCE
+from lasercal_gtsam.io.follow_pictures import PATIENCE_S
 from lasercal_gtsam.io.known_spots import KnownSpots
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.simulate.render import RenderOptions, make_scene, render_pair
@@ -26,6 +26,7 @@ lasercal: 1
 camera: {name: camera, width: 160, height: 120}
 poses: {file: poses.csv, transform: T_base_hand, length: mm, rotation: kuka}
 """
+PATIENCE = int(PATIENCE_S / 0.5)  # looks
 COLUMNS = "id,plane,x,y,z,a,b,c,u,v\n"
 SHAPE = ellipse(2.2, 1.4, 0.4)
 CLEAN = RenderOptions(highlights=0, ghost_probability=0.0)
@@ -45,14 +46,16 @@ class Watched:
         self.start()
 
     def start(self, **options) -> None:
-        self.follower = CaptureFollower(self.folder, self.known, **options)
+        self.now = 1000.0
+        self.follower = CaptureFollower(self.folder, self.known, clock=lambda: self.now, **options)
 
     def append(self, text: str | bytes, name: str = "poses.csv") -> None:
         with (self.folder / name).open("ab") as file:
             file.write(text if isinstance(text, bytes) else text.encode())
 
     def poll(self) -> tuple[list[str], list[Notice]]:
-        """Ids of new spots, and what was said."""
+        """Ids of new spots, and what was said, half a second later."""
+        self.now += 0.5
         items = list(self.follower.poll())
         self.spots = [item for item in items if isinstance(item, Observations)]
         ids = [name for spots in self.spots for name in spots.id.tolist()]
