@@ -7,6 +7,7 @@ no direction is singular and nothing depends on how the table writes angles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -39,6 +40,7 @@ Part = Literal["camera", "laser", "plane"]
 Mask = npt.NDArray[np.bool_]
 POSE = 6  # the camera's pose comes first of its coordinates
 _MAX_ITERATIONS = 100
+_CONVERGED_SIGMAS = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,13 +199,16 @@ def fuse(
     state = chart.state(z)
     fused = cell_from_state(state, cell)
     values.update(CELL_KEY, z)
-    H = np.asarray(graph.linearize(values).hessian()[0])
+    H, b = graph.linearize(values).hessian()
+    H, b = np.asarray(H), np.asarray(b)
+    step = np.linalg.lstsq(H, b, rcond=1e-14)[0]
+    decrement = math.sqrt(max(float(b @ step), 0.0))
     H[belief.held], H[:, belief.held] = 0.0, 0.0
     lengths = batch.whitened_lengths(state)
     lengths = np.where(np.isnan(lengths), np.inf, lengths)
     troubles: list[str] = []
-    if not np.isfinite(graph.error(values)):
-        troubles.append("the error is not finite")
+    if not decrement < _CONVERGED_SIGMAS:
+        troubles.append(f"not converged: one more step would move {decrement:.2g} sigma")
     if optimizer.iterations() >= _MAX_ITERATIONS:
         troubles.append(f"not converged in {_MAX_ITERATIONS} iterations")
     after = replace(belief, cell=fused, information=carried(H, chart, z, state))

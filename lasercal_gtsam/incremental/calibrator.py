@@ -180,8 +180,7 @@ class IncrementalCalibrator:
             A camera's image size differs from what it was.
         """
         self._check_sizes(observations)
-        cov_uv = pixel_covariances(observations, self._settings.sigma_px)
-        numbers = self._store.append(observations, cov_uv)
+        numbers = self._store.append(observations, self._settings.sigma_px)
         seen: list[Innovation | None] = [None] * len(numbers)
         if self._filter is None:
             self._collect()
@@ -255,7 +254,7 @@ class IncrementalCalibrator:
         self._settings = self._settings.informed_by(calibration)
         fit, spots = calibration.fit, calibration.inputs.observations
         if holds_its_spots(calibration):
-            self._store.append(spots, pixel_covariances(spots, self._settings.sigma_px))
+            self._store.append(spots, self._settings.sigma_px)
             self._begin(calibration, _start_words(calibration))
             return
         self._older, self._older_used = fit.n_spots + fit.n_rejected, fit.n_spots
@@ -336,11 +335,12 @@ class IncrementalCalibrator:
             self._alarm = replace(alarm, spots=count)
             return
         found = self._diagnosis()
-        words = f"since spot {alarm.since}: {found.words}"
-        self._alarm = replace(alarm, spots=count, causes=found.causes, words=words)
-        if not alarm.causes:
+        causes, why = ((), found) if isinstance(found, str) else (found.causes, found.words)
+        words = f"since spot {alarm.since}: {why}"
+        self._alarm = replace(alarm, spots=count, causes=causes, words=words)
+        if not alarm.words:
             self._note("alarm", words)
-        if not found.settled or count < _FEWEST:
+        if isinstance(found, str) or not found.settled or count < _FEWEST:
             return
         cause = found.causes[0]
         if cause.kind == "outliers":
@@ -350,19 +350,25 @@ class IncrementalCalibrator:
         elif self._settings.automatic and cause.kind in KINDS:
             self._free([(cause.kind, cause.name)], cause.words)
 
-    def _diagnosis(self) -> Diagnosis:
+    def _diagnosis(self) -> Diagnosis | str:
+        """What explains the spots since the alarm, or why that cannot be told."""
         filter = self._running()
         end = min(self._store.end, self._since + _DIAGNOSED)
         spots = self._store.observations(self._since, end)
         good = determined(spots, filter.template, self._open)
+        if not good.any():
+            return "something has changed; its spots are of parts that are not known yet"
         cov_uv = filter.scale**2 * pixel_covariances(spots, self._settings.sigma_px)
-        return diagnose(
-            filter.estimate.belief(),
-            spots[good],
-            cov_uv[good],
-            outlier_rate=self._watchman.outlier_rate,
-            hand_noise=self._settings.hand,
-        )
+        try:
+            return diagnose(
+                filter.estimate.belief(),
+                spots[good],
+                cov_uv[good],
+                outlier_rate=self._watchman.outlier_rate,
+                hand_noise=self._settings.hand,
+            )
+        except DegenerateError as error:
+            return f"something has changed; what it is cannot be told: {error}"
 
     def _end_alarm(self, kind: EventKind, words: str) -> None:
         """Take the spots that were held back as they are."""
@@ -479,7 +485,6 @@ class IncrementalCalibrator:
                 if mark == LEFT_OUT
             ),
             held_back=tuple(x for x, mark in zip(labels, marks, strict=True) if mark == HELD_BACK),
-            innovation=innovations_of(labels, seen),
             alarm=self._alarm,
             missing=self._missing,
             events=events,
@@ -487,6 +492,7 @@ class IncrementalCalibrator:
             n_used=0 if estimate is None else self._used(estimate),
             sigma0=float("nan") if estimate is None else self._settings.unit * estimate.sigma0,
             rms_px=float("nan") if estimate is None else estimate.rms_px,
+            _innovation=lambda: innovations_of(labels, seen),
             _cell=lambda: None if estimate is None else estimate.cell,
             _parameters=lambda: () if estimate is None else parameters_of(estimate, initial),
             _calibration=self._answer(estimate),
@@ -510,27 +516,26 @@ class IncrementalCalibrator:
         """The whole result as it stands now, to be made when somebody asks."""
         if estimate is None or self._filter is None:
             return lambda: None
-        store, first, end = self._store, self._store.first, self._store.end
-        waiting, troubles = list(self._pending), [missing.words for missing in self._missing]
-        if self._alarm is not None:
-            waiting += range(self._since, end)
-            troubles.append(self._alarm.words)
-        account = Account(
-            initial=self._initial,
-            options=self._settings.options,
-            sigma_px=self._settings.sigma_px,
-            limit=self._filter.limit,
-            waiting=tuple(waiting),
-            older=self._older + first,
-            words=self._words,
-            troubles=tuple(troubles),
-            notes=(),
-        )
-        unit = self._settings.unit
+        store, first, end, older = self._store, self._store.first, self._store.end, self._older
+        settings, limit = self._settings, self._filter.limit
+        initial, words, missing, alarm = self._initial, self._words, self._missing, self._alarm
+        waiting = (*self._pending, *range(self._since, end)) if alarm else tuple(self._pending)
 
         def make() -> Calibration:
             begin = max(first, store.first)
-            return calibration_of(estimate, store.observations(begin, end), begin, account, unit)
+            troubles = [m.words for m in missing] + ([] if alarm is None else [alarm.words])
+            account = Account(
+                initial=initial,
+                options=settings.options,
+                sigma_px=settings.sigma_px,
+                limit=limit,
+                waiting=waiting,
+                older=older + first,
+                words=words,
+                troubles=tuple(troubles),
+            )
+            spots = store.observations(begin, end)
+            return calibration_of(estimate, spots, begin, account, settings.unit)
 
         return make
 

@@ -41,7 +41,7 @@ Marks = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
 
 # spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
-SLICE, SLICE_HAND = 600, 200
+SLICE, SLICE_HAND = 300, 150
 # up to this many spots, all are relinearised within the update
 FEW = 1000
 # joint distance in sigmas from the point of linearisation at which a pass begins

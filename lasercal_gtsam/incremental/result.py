@@ -44,7 +44,7 @@ class Account:
     waiting : number of every spot that waits
     older : spots that live on in the prior only
     words : what is held
-    troubles, notes : sentences
+    troubles : sentences
     """
 
     initial: Cell
@@ -55,7 +55,6 @@ class Account:
     older: int
     words: tuple[str, ...]
     troubles: tuple[str, ...]
-    notes: tuple[str, ...]
 
 
 def uncertainty_of(estimate: Estimate, unit: float = 1.0) -> Uncertainty:
@@ -98,7 +97,7 @@ def calibration_of(
         rejected[k - first] = "held back: it waits for more spots, or for the end of an alarm"
     used = np.array([reason is None for reason in rejected], dtype=np.bool_)
     fit = _fit(estimate, account, residuals[used], int((~used).sum()), unit)
-    notes = [*account.notes, *fold_warnings(cell), *report_notes(cell, uncertainty)]
+    notes = [*fold_warnings(cell), *report_notes(cell, uncertainty)]
     if account.older:
         notes.append(f"{account.older} older spots live on as prior knowledge only")
     svd = RangeSvd.of(estimate.R[:-1, :-1], uncertainty.labels, ~(estimate.held | estimate.open))

@@ -39,20 +39,15 @@ class SpotStore:
     def __len__(self) -> int:
         return self.end - self.first
 
-    def append(self, observations: Observations, cov_uv: Array, mark: int = HELD_BACK) -> range:
-        """Store spots, with the pixel covariances (N, 2, 2) they count with; their numbers."""
-        records = records_of(observations, cov_uv)
+    def append(
+        self, observations: Observations, sigma_px: float = 1.0, mark: int = HELD_BACK
+    ) -> range:
+        """Store spots; those without a covariance count with ``sigma_px``. The numbers they got."""
+        stated = ~np.isnan(observations.cov_uv[:, 0, 0])
+        records = records_of(observations, stated, sigma_px)
         self.image_size.update(observations.image_size)
-        numbers = [
-            self._path(path)
-            for path in zip(
-                observations.camera.tolist(),
-                observations.laser.tolist(),
-                observations.plane.tolist(),
-                (~np.isnan(observations.cov_uv[:, 0, 0])).tolist(),
-                strict=True,
-            )
-        ]
+        names = (observations.camera, observations.laser, observations.plane, stated)
+        numbers = [self._path(path) for path in zip(*(x.tolist() for x in names), strict=True)]
         start, labels = self.end, observations.id.tolist()
         done = 0
         while done < len(records):
@@ -174,18 +169,20 @@ class SpotStore:
         return self._segments[number]
 
 
-def records_of(observations: Observations, cov_uv: Array) -> Array:
-    """Rows of `lasercal_factors.stream_kernels`, (N, 14)."""
+def records_of(observations: Observations, stated: npt.NDArray[np.bool_], sigma_px: float) -> Array:
+    """Rows of `lasercal_factors.stream_kernels`, (N, 14).
+
+    ``stated`` (N,): spots with a pixel covariance of their own; the others have ``sigma_px``.
+    """
     T = observations.T_base_hand
-    return np.column_stack(
-        [
-            observations.uv,
-            whitening_from_covariance(cov_uv),
-            T[:, :3, 0],
-            T[:, :3, 1],
-            T[:, :3, 3],
-        ]
-    )
+    records = np.empty((len(observations), RECORD))
+    records[:, :2] = observations.uv
+    records[:, 2:5] = (1.0 / sigma_px, 0.0, 1.0 / sigma_px)
+    if stated.any():
+        records[stated, 2:5] = whitening_from_covariance(observations.cov_uv[stated])
+    records[:, 5:8], records[:, 8:11] = T[:, :3, 0], T[:, :3, 1]
+    records[:, 11:14] = T[:, :3, 3]
+    return records
 
 
 def split_records(records: Array) -> tuple[Array, Array, Array]:

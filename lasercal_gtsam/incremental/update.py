@@ -104,7 +104,7 @@ class Alarm:
     since : label of the first spot that was affected
     since_number : how many spots came before it
     spots : how many spots have come since, that one included
-    causes : explanations, the most likely first
+    causes : explanations, the most likely first; empty where none could be judged
     words : one sentence for the engineer
     """
 
@@ -115,9 +115,9 @@ class Alarm:
     words: str
 
     @property
-    def cause(self) -> Cause:
-        """The most likely explanation."""
-        return self.causes[0]
+    def cause(self) -> Cause | None:
+        """The most likely explanation; None where none could be judged."""
+        return self.causes[0] if self.causes else None
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,6 @@ class Update:
     accepted : labels of the new spots that the estimate uses
     rejected : new spots that it does not use, with reasons
     held_back : labels of new spots that wait: for more of their kind, or for an alarm's outcome
-    innovation : how the new spots compare with what was expected
     alarm : an open alarm, or None
     missing : what must come before everything can be estimated; empty when all is
     events : what happened in this update
@@ -157,7 +156,6 @@ class Update:
     accepted: tuple[str, ...]
     rejected: tuple[Rejection, ...]
     held_back: tuple[str, ...]
-    innovation: Innovations
     alarm: Alarm | None
     missing: tuple[Missing, ...]
     events: tuple[Event, ...]
@@ -165,9 +163,15 @@ class Update:
     n_used: int
     sigma0: float
     rms_px: float
+    _innovation: Callable[[], Innovations] = field(repr=False)
     _cell: Callable[[], Cell | None] = field(repr=False)
     _parameters: Callable[[], tuple[Parameter, ...]] = field(repr=False)
     _calibration: Callable[[], Calibration | None] = field(repr=False)
+
+    @cached_property
+    def innovation(self) -> Innovations:
+        """How the new spots compare with what was expected of them."""
+        return self._innovation()
 
     @cached_property
     def cell(self) -> Cell | None:

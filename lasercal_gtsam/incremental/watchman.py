@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+from lasercal_factors.change_arrays import Looks
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.incremental.detector import Detector
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.innovation import Innovation
-from lasercal_gtsam.incremental.looks import Look
 from lasercal_gtsam.incremental.store import LEFT_OUT, Path, SpotStore
 
 # looks whose spots are remembered; the detector's own window is shorter
@@ -33,6 +33,15 @@ class Watchman:
         self._numbers: deque[int] = deque(maxlen=_REMEMBERED)
         self._index: dict[Path, tuple[int, int, int]] = {}
         self._cell = cell
+        self._look = Looks(
+            e=np.empty((1, 2)),
+            who=np.empty((1, 3), np.int64),
+            by_camera=np.empty((1, 2, 6)),
+            by_laser=np.empty((1, 2, 4)),
+            by_plane=np.empty((1, 2, 3)),
+            area=np.empty(1),
+            dof=np.empty(1),
+        )
         if len(store):
             who = np.array([self._who(path) for path in store.paths], dtype=np.int64)
             outlier = store.marks() == LEFT_OUT
@@ -48,17 +57,13 @@ class Watchman:
         path = store.path_of(number)
         width, height = store.image_size[path[0]]
         self._numbers.append(number)
-        verdict = self._detector.look(
-            Look(
-                seen.e,
-                *self._who(path),
-                seen.by_parts[:, :6],
-                seen.by_parts[:, 6:10],
-                seen.by_parts[:, 10:],
-                width * height / seen.area,
-                max(filter.dof, 1.0),
-            )
-        )
+        look = self._look
+        look.e[0], look.who[0] = seen.e, self._who(path)
+        look.by_camera[0] = seen.by_parts[:, :6]
+        look.by_laser[0] = seen.by_parts[:, 6:10]
+        look.by_plane[0] = seen.by_parts[:, 10:]
+        look.area[0], look.dof[0] = width * height / seen.area, max(filter.dof, 1.0)
+        (verdict,) = self._detector.look_many(look)
         if verdict.since is None:
             return None
         back = self._detector.number - verdict.since

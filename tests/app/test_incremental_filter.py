@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from incremental_cases import PLAIN, batch_of, shuffled, sigmas_between, stream
@@ -39,7 +41,7 @@ def calibration(spots):
 
 def stored(spots, sigma_px=1.0, mark=USED):
     store = SpotStore(dict(spots.image_size))
-    store.append(spots, pixel_covariances(spots, sigma_px), mark)
+    store.append(spots, sigma_px, mark)
     return store
 
 
@@ -80,7 +82,7 @@ def numerical(chart, template, z, spots, cov):
 def test_accumulate_is_the_information_of_the_used_spots_in_the_chart(spots, calibration):
     cov = np.tile([[1.2, 0.3], [0.3, 0.7]], (len(spots), 1, 1))
     store = SpotStore(dict(spots.image_size))
-    store.append(spots, cov, USED)
+    store.append(replace(spots, cov_uv=cov), mark=USED)
     filter = Filter(store, calibration.cell, np.zeros(28, np.bool_), (None,))
     filter.use(0, len(spots))
     z = somewhere(filter.chart)
@@ -134,7 +136,7 @@ def test_hand_corrections_are_those_of_the_batch_method(spots, calibration):
     noise = HandNoise(1e-3, np.deg2rad(0.05))
     cov = pixel_covariances(spots, 0.5)
     store = SpotStore(dict(spots.image_size))
-    store.append(spots, cov, USED)
+    store.append(spots, 0.5, USED)
     weighing = Weighing(noise.variances, 1.0)
     filter = Filter(store, calibration.cell, np.zeros(28, np.bool_), (None,), weighing=weighing)
     filter.use(0, len(spots))
@@ -157,7 +159,7 @@ def test_an_innovation_is_prediction_and_its_covariance(spots, calibration):
     filter = running(known, first, scale=first.fit.sigma0)
     filter.use(0, len(known))
     filter.relinearise()
-    filter.store.append(new, pixel_covariances(new, 1.0))
+    filter.store.append(new)
     seen = filter.expect(len(known))
     names = {"plane": str(new.plane[0])}
     uv, cov = first.predict(new.T_base_hand, **names)
@@ -326,10 +328,9 @@ def test_the_store_gives_back_what_it_got_across_segments(spots):
     whole = spots
     while len(whole) < 3000:
         whole = whole + whole
-    cov = pixel_covariances(whole, 2.0)
     pieces = 0
     while len(store) < SEGMENT + 500:
-        store.append(whole, cov, USED)
+        store.append(whole, 2.0, USED)
         pieces += 1
     back = store.observations(SEGMENT - 100, SEGMENT + 100)
     number = (SEGMENT - 100) % len(whole)
@@ -345,7 +346,7 @@ def test_the_store_gives_back_what_it_got_across_segments(spots):
 
 
 def test_a_stored_spot_takes_112_bytes(spots):
-    records = records_of(spots, pixel_covariances(spots, 0.7))
+    records = records_of(spots, np.zeros(len(spots), np.bool_), 0.7)
     assert records[0].nbytes == 112
     uv, cov, T = split_records(records)
     assert np.array_equal(uv, spots.uv)
