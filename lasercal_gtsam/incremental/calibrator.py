@@ -161,12 +161,15 @@ class IncrementalCalibrator:
 
     @property
     def history(self) -> tuple[HistoryRow, ...]:
-        """The table at moments that grow rarer, and at every event."""
+        """The table at moments that grow rarer, at every event, and now."""
+        updates = list(self._history)
+        if updates and updates[-1].n_spots < self.n_spots:
+            updates.append(self._last)
         return tuple(
             HistoryRow(
                 u.n_spots, u.rms_px, u.sigma0, u.parameters, tuple(e.words for e in u.events)
             )
-            for u in self._history
+            for u in updates
         )
 
     # --- what can be done -----------------------------------------------------------------------
@@ -394,7 +397,7 @@ class IncrementalCalibrator:
         self._watchman.forgive(onset)
         self._use_ready()
         named = " and ".join(f"{kind} {name!r}" for kind, name in parts)
-        self._note("reset", f"{named} freed{': ' + why if why else ''}")
+        self._note("reset", f"{why}; freed" if why else f"{named} freed")
 
     def _extend(self) -> None:
         """Find parts that are new or freed, as far as the spots that wait determine them."""

@@ -336,10 +336,10 @@ class Filter:
         kernels.constrain(prior, held, *ties)
         prior[:-1, :-1][held, held] = 0.0
         self.prior = marginalised(prior, columns, np.append(held, False))
-        free = np.zeros_like(held)
-        free[columns] = True
-        self.prior_rows -= float((free & ~held).sum())
-        self.open[columns] = True
+        part = np.zeros_like(held)
+        part[columns] = True
+        self.prior_rows -= float((part & ~held).sum())
+        self.open = self.open | part
         self._constraints = self._constrain()
         self._unknowns = self._count_unknowns()
         self._pass = None

@@ -45,7 +45,13 @@ def calibrated(out):
 
 def test_every_script_is_listed_and_tested():
     scripts = sorted(path.name for path in EXAMPLES.glob("*.py"))
-    assert scripts == ["0_simulate.py", "1_calibrate.py", "2_use_result.py", "3_own_graph.py"]
+    assert scripts == [
+        "0_simulate.py",
+        "1_calibrate.py",
+        "2_use_result.py",
+        "3_own_graph.py",
+        "4_keep_calibrated.py",
+    ]
     readme = (EXAMPLES / "README.md").read_text()
     assert all(f"`{script}`" in readme for script in scripts)
 
@@ -97,6 +103,21 @@ def test_3_own_graph_agrees_with_the_whole_calibration(out):
     assert float(angle) < 3 * float(tilt) < 3
     plane = load_cell(EXAMPLES / "capture" / "truth.json").planes["3"]
     assert abs(float(found) - 1000 * plane.distance) < 4 * float(sigma)
+
+
+def test_4_keep_calibrated_names_the_bump_and_mends_it(out):
+    text = run("4_keep_calibrated.py", out)
+    events = re.findall(r"^spot (\d+) \(s\d+\): (\w+): ", text, re.MULTILINE)
+    assert [kind for _, kind in events] == ["alarm", "reset", "recovered"]
+    assert 180 < int(events[0][0]) <= 185
+    moved = re.search(
+        rf"moved by ({NUMBER}) \+- ({NUMBER}) mm and ({NUMBER}) \+- ({NUMBER}) deg;", text
+    )
+    shift, sigma_shift, turn, sigma_turn = map(float, moved.groups())
+    assert abs(shift - 2.0) < 3 * sigma_shift
+    assert abs(turn - 0.5) < 3 * sigma_turn
+    last = text.splitlines()[-1].split()
+    assert last[0] == "300" and "300 used" in text
 
 
 def test_the_start_from_drawings_leads_to_the_same_answer(capsys, tmp_path):

@@ -139,6 +139,8 @@ def test_automatic_does_it_by_itself_and_records_it(scene, kind):
     assert "moved by" in calibrator.events[2].words
     assert calibrator.alarm is None and normalised_error(calibrator, cell, kind) < 3.0
     rows = [row for row in calibrator.history if row.events]
+    # what was known before stays known in the trace
+    assert all(p.sigma > 0 for p in calibrator.history[0].parameters if p.unit != "1")
     assert any("freed" in word for row in rows for word in row.events)
 
 
