@@ -28,7 +28,7 @@ from lasercal_gtsam.io.plain import plain
 if TYPE_CHECKING:
     from lasercal_gtsam.history import HistoryRow
     from lasercal_gtsam.incremental.journaled import JournaledCalibrator
-    from lasercal_gtsam.incremental.update import Update
+    from lasercal_gtsam.incremental.update import Alarm, Update
     from lasercal_gtsam.io.follow import Notice
     from lasercal_gtsam.observations import Observations
 
@@ -82,6 +82,16 @@ class Keeper:
         self._cost = 0.0
         self._said_unsaved = False
 
+    def greet(self) -> None:
+        """Say what the journal gave, where it gave something."""
+        session = self.session
+        if session.repaired:
+            self.screen.warn(f"Warning: {session.repaired}")
+        if session.replayed:
+            so_far = count(session.calibrator.n_spots, "spot")
+            self.screen.line(f"Gone on from {session.path}: {so_far} so far.")
+        self._say_alarm(session.calibrator.alarm)
+
     def take(self, spots: Sequence[Observations]) -> None:
         """Journal spots, then take one after the other, saying what happens.
 
@@ -108,7 +118,7 @@ class Keeper:
         for event in update.events:
             if event.kind != "alarm":
                 self.screen.line(f"{count(event.spots, 'spot')}: {event.kind}: {event.words}")
-        self._say_alarm(update)
+        self._say_alarm(update.alarm)
         if self.screen.live:
             for rejection in update.rejected:
                 self.screen.line(f"id {rejection.id} rejected: {rejection.reason}")
@@ -120,16 +130,15 @@ class Keeper:
         if update.events:
             self.save(now=True)
 
-    def _say_alarm(self, update: Update) -> None:
-        alarm = update.alarm
+    def _say_alarm(self, alarm: Alarm | None) -> None:
         if alarm is None:
             self._alarm = None
             return
-        what = (alarm.since, alarm.causes and alarm.cause.kind, moved_part(alarm))
+        likely = alarm.causes[0].kind if alarm.causes else ""
+        what = (alarm.since, likely, moved_part(alarm))
         if self._alarm == what:
             return
         self._alarm = what
-        self._dirty = True
         words = alarm_words(alarm, _HOW[self._conversation])
         self.screen.line(click.style(f"Alarm: {words}", fg=_RED))
 

@@ -160,9 +160,10 @@ def state_words(update: Update) -> str:
 
 def moved_part(alarm: Alarm) -> tuple[str, str] | None:
     """What has moved, kind and name, where that is as good as certain."""
-    if not alarm.causes or alarm.cause.kind not in ("camera", "laser", "plane"):
+    cause = alarm.causes[0] if alarm.causes else None
+    if cause is None or cause.kind not in ("camera", "laser", "plane"):
         return None
-    return (alarm.cause.kind, alarm.cause.name) if alarm.cause.probability > _CERTAIN else None
+    return (cause.kind, cause.name) if cause.probability > _CERTAIN else None
 
 
 def alarm_words(alarm: Alarm, how: str) -> str:

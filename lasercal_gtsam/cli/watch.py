@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from lasercal_gtsam.cli.calibrate import CALIBRATION_FILE
-from lasercal_gtsam.cli.console import warn
+from lasercal_gtsam.cli.console import progress, warn
 from lasercal_gtsam.cli.live import Screen, Stopper
 from lasercal_gtsam.cli.outputs import check_calibration_target, check_writable
 from lasercal_gtsam.cli.running import (
@@ -22,7 +22,6 @@ from lasercal_gtsam.cli.running import (
     reset_option,
     stated_sigma,
 )
-from lasercal_gtsam.cli.texts import count
 from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.io.capture_head import CaptureHead
     from lasercal_gtsam.options import CalibrationOptions
 
-_STDIN = 0
+_STDIN, _LONGEST_LINE = 0, 1 << 20
 
 
 class _Head(NamedTuple):
@@ -166,17 +165,22 @@ def watch(
             conversation=from_stdin,
             as_json=as_json,
         )
-        _greet(session, screen)
+        keeper.greet()
         for part, name in named_parts(resets, session.calibrator.cell):
             keeper.said(session.reset(part, name))
         if dismiss:
             keeper.said(session.dismiss())
         limit = 0.0 if once else until_idle
+        waiting: dict[str, str] = {}
         with Stopper() as stop, screen:
-            if said is None or from_stdin:
-                ended, waiting = _listen(keeper, said, stop, limit), dict[str, str]()
-            else:
-                ended, waiting = _follow(keeper, said, prefix, stop, interval, limit)
+            try:
+                if said is None or from_stdin:
+                    ended = _listen(keeper, said, stop, limit)
+                else:
+                    ended, waiting = _follow(keeper, said, prefix, stop, interval, limit)
+            except BrokenPipeError:  # nobody reads the answers any more
+                keeper.save(now=True)
+                raise
             keeper.finish(waiting)
     return 1 if ended and session.calibrator.alarm is not None else 0
 
@@ -211,13 +215,16 @@ def _open(
     if _is_begun(journal):
         if start is not None and start.resolve() == target.resolve():
             start = None  # it has become the result; the journal keeps a copy
-    elif start is None and target.exists():
+    elif start is None and target.exists() and target.stat().st_size:
         raise DataError(
             f"{target}: there is a calibration already, and no journal {journal.name} of it; go on "
             f"from it with --calibration {target}, or give another name with -o"
         )
     options = None if said is None else said.options()
-    session = JournaledCalibrator(journal, start=start, options=options, settings=settings)
+    with progress("Going through the journal") as show:
+        session = JournaledCalibrator(
+            journal, start=start, options=options, settings=settings, progress=show
+        )
     try:
         if said is not None:
             session.check_sizes({c.name: (c.width, c.height) for c in said.head.camera})
@@ -257,15 +264,6 @@ def _earlier(
         return ()
     place = target if session.replayed and history_path(target).exists() else start or target
     return earlier_rows(history_path(place), own[0].spots)
-
-
-def _greet(session: JournaledCalibrator, screen: Screen) -> None:
-    if session.repaired:
-        screen.warn(f"Warning: {session.repaired}")
-    if session.replayed:
-        screen.line(
-            f"Gone on from {session.path}: {count(session.calibrator.n_spots, 'spot')} so far."
-        )
 
 
 def _sigma(session: JournaledCalibrator, said: _Head | None) -> float | None:
@@ -345,4 +343,6 @@ def _lines(stop: Stopper) -> Iterator[list[bytes]]:
             if rest.strip():
                 yield [rest]
             return
+        if len(rest) > _LONGEST_LINE:
+            lines, rest = [*lines, rest], b""
         yield lines

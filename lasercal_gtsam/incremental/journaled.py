@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
     from lasercal_gtsam.incremental.update import Update
 
+Progress = Callable[[int, int], None]
+
 SPOT, RESET, DISMISS = "spot", "reset", "dismiss"
 
 
@@ -36,6 +38,7 @@ class JournaledCalibrator:
     start : ``calibration.json`` to begin with; may be left out when the journal is there
     options : as for `calibrate`, for a beginning without a start (a start has its own)
     settings : ``automatic``, ``max_spots``, ``half_life`` of `IncrementalCalibrator`
+    progress : called with (records gone through, records there are)
 
     Attributes
     ----------
@@ -60,17 +63,18 @@ class JournaledCalibrator:
         start: str | Path | None = None,
         options: CalibrationOptions | None = None,
         settings: Mapping[str, Any] | None = None,
+        progress: Progress | None = None,
     ) -> None:
         self.path = Path(path)
         wanted = _About(start, options, dict(settings or {}))
         self._journal = Journal.open(self.path, wanted.header)
         try:
-            self._open(wanted)
+            self._open(wanted, progress)
         except BaseException:
             self._journal.close()
             raise
 
-    def _open(self, wanted: _About) -> None:
+    def _open(self, wanted: _About, progress: Progress | None) -> None:
         copy = self.path.with_name(f"{self.path.name}.start")
         about = self._journal.about
         wanted.check(about, self.path)
@@ -87,6 +91,8 @@ class JournaledCalibrator:
         for record in JournalReader(self.path):
             self._replay(record.kind, record.payload, record.seq)
             self.replayed += 1
+            if progress is not None:
+                progress(self.replayed, self._journal.count)
 
     def _load_start(self, digest: str | None, given: Path | None, copy: Path) -> Calibration | None:
         if digest is None:

@@ -28,9 +28,14 @@ from stream_cases import (
 )
 
 import lasercal_gtsam as lc
+from lasercal_gtsam.cli.answers import Answers
+from lasercal_gtsam.cli.keeper import Keeper
+from lasercal_gtsam.cli.live import Screen
 from lasercal_gtsam.incremental import IncrementalCalibrator
+from lasercal_gtsam.incremental.journaled import JournaledCalibrator
 from lasercal_gtsam.io.history_file import read_history
 from lasercal_gtsam.io.journal import JournalReader
+from lasercal_gtsam.io.spot_lines import SpotLines
 
 N = len(stream())
 
@@ -316,6 +321,12 @@ def test_an_alarm_names_the_cause_and_what_to_do(lasercal, growing, tmp_path):
         "with --dismiss."
     )
     assert "ALARM open" in outcome.out
+    again = lasercal(*args)  # it is said again, and stays open
+    assert again.status == 1
+    assert again.out.splitlines()[1].startswith("Alarm: since spot b")
+    assert again.out.splitlines()[1].endswith(
+        "--reset camera:camera; if nothing has moved, with --dismiss."
+    )
     append(growing, *other[13:])
     outcome = lasercal(*args, "--reset", "camera")
     assert outcome.status == 0, outcome.out
@@ -407,8 +418,6 @@ def test_wrong_columns_at_the_start_are_an_error(lasercal, growing):
 
 def test_a_second_watch_is_kept_out(lasercal, growing, rows):
     append(growing, *rows[1:3])
-    from lasercal_gtsam.incremental.journaled import JournaledCalibrator
-
     settings = {"automatic": False, "max_spots": None, "half_life": None}
     path = growing / "calibration.journal.jsonl"
     with JournaledCalibrator(path, options=OPTIONS, settings=settings):
@@ -429,6 +438,26 @@ def test_the_live_line(lasercal, growing, rows, monkeypatch):
     assert drawn[-1] == ""  # wiped at the end
     assert outcome.out.splitlines()[-1].startswith("Saved")
     assert "\x1b" not in outcome.out
+
+
+def test_pictures_are_looked_at_as_they_come(lasercal, tmp_path):
+    folder = tmp_path / "pictures"
+    small = ("--preset", "paper-1", "--groups", "1", "--shots", "4", "--pictures")
+    assert lasercal("simulate", folder, *small).status == 0
+    late = folder / "images" / "s003.png"
+    late.rename(tmp_path / "late.png")
+    args = ("watch", folder, "--once", "--interval", "0.05")
+    outcome = lasercal(*args)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert "Ended: 3 spots taken, 3 in all; " in outcome.out
+    assert f"waiting: s003: the picture {late} is not there yet." in outcome.out
+    assert not (folder / "calibration.json").exists()  # no estimate yet
+    (tmp_path / "late.png").rename(late)
+    assert "Ended: 1 spot taken, 4 in all" in lasercal(*args).out
+    expected = lc.load_capture(folder).observations()
+    records = JournalReader(folder / "calibration.journal.jsonl")
+    seen = {r.payload["id"][0]: r.payload["uv"][0] for r in records}
+    assert seen == dict(zip(expected.id.tolist(), expected.uv.tolist(), strict=True))
 
 
 def test_usage(lasercal, growing):
@@ -501,6 +530,56 @@ def test_a_conversation(growing, tmp_path):
     assert [r.kind for r in JournalReader(growing / "calibration.journal.jsonl")][-2:] == [
         "reset", "reset",
     ]  # fmt: skip
+
+
+@pytest.fixture
+def conversation(tmp_path, capsys):
+    """The conversation without a process: lines in, documents out."""
+    settings = {"automatic": False, "max_spots": None, "half_life": None}
+    with JournaledCalibrator(tmp_path / "j.jsonl", options=OPTIONS, settings=settings) as session:
+        screen = Screen(err=True)
+        keeper = Keeper(session, tmp_path / "c.json", screen, sources={}, conversation=True)
+        answers = Answers(keeper, SpotLines({}))
+
+        def say(*lines: object) -> list[dict]:
+            capsys.readouterr()
+            answers.take([json.dumps(line).encode() for line in lines])
+            return [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+
+        say.session = session
+        yield say
+
+
+def test_every_line_gets_its_answer_in_order(conversation):
+    first = conversation(spot(0), {"image_size": [640, 480]}, spot(0), spot(1), spot(0), spot(2))
+    assert [a.get("status") for a in first] == [
+        None, None, "held back", "held back", "known", "held back",
+    ]  # fmt: skip
+    assert "the image size is not known yet" in first[0]["error"]
+    assert [a.get("n_spots") for a in first[1:]] == [0, 1, 2, 2, 3]
+    assert first[2]["missing"][0].startswith("at least 15 spots are needed")
+    (again,) = conversation({"image_size": [641, 480]})
+    assert "image size 641 x 480, but it was 640 x 480" in again["error"]
+    clash = conversation(spot(3), spot(3, uv=[1, 1]))
+    assert clash[0]["status"] == "held back"
+    assert clash[1]["error"].startswith("line 9: id: 's003' is in this journal already")
+    (early,) = conversation({"reset": {"camera": "camera"}})
+    assert "there is no estimate yet" in early["error"]
+
+
+def test_a_full_disk_is_answered_and_the_spot_may_come_again(conversation, monkeypatch):
+    conversation({"image_size": [640, 480]}, spot(0))
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", full)
+        answers = conversation(spot(1), spot(2))
+    assert [a["id"] for a in answers] == ["s001", "s002"]
+    assert all("No space left on device; it does not count" in a["error"] for a in answers)
+    assert [a["n_spots"] for a in conversation(spot(1), spot(2))] == [2, 3]
+    assert conversation.session.calibrator.n_spots == 3
 
 
 def test_ctrl_c_on_standard_input(growing, tmp_path):
