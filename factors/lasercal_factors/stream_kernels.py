@@ -280,16 +280,15 @@ def accumulate(records, path, mark, view, noise, limit, judge, age):
     -------
     H (n+1, n+1) : ``[J r]^T [J r]`` over the used spots in chart coordinates; [0, 0] NaN where a
         used spot cannot be
-    sums (3,) : weight of the used spots (their number, if nothing fades); their squared pixel
-        residuals, px^2; the loss: squared whitened lengths, no more than the limit's for each spot
-        that is not held back
+    sums (4,) : weight of the used spots (their number, if nothing fades); their squared pixel
+        residuals, px^2; their squared whitened lengths; weight of the spots left out
     """
     everyone, order, offsets = gather(records, path, view)
     if np.any(noise.hand > 0.0):
         correct_hands(everyone, view.state, noise.hand)
     lengths2, pixels2 = squared_lengths(everyone, view.state)
     blocks, kept = everyone.blocks.copy(), 0
-    sums = np.zeros(3)
+    sums = np.zeros(4)
     for m in range(len(blocks)):
         first = kept
         for k in range(everyone.blocks[m, 3], everyone.blocks[m, 4]):
@@ -297,10 +296,10 @@ def accumulate(records, path, mark, view, noise, limit, judge, age):
             if mark[i] == HELD_BACK:
                 continue
             w = noise.fade ** (age - i) if noise.fade < 1.0 else 1.0
-            sums[2] += w * min(lengths2[k], limit * limit)
             if judge:
                 mark[i] = USED if lengths2[k] <= limit * limit else LEFT_OUT
             if mark[i] != USED:
+                sums[3] += w
                 continue
             root = math.sqrt(w)
             for j in range(5):
@@ -309,6 +308,7 @@ def accumulate(records, path, mark, view, noise, limit, judge, age):
                 everyone.hands[j, kept] = everyone.hands[j, k]
             sums[0] += w
             sums[1] += w * pixels2[k]
+            sums[2] += w * lengths2[k]
             kept += 1
         blocks[m, 3], blocks[m, 4] = first, kept
     used = Spots(everyone.pixels, everyone.hands, blocks)

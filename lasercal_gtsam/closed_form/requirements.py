@@ -66,9 +66,11 @@ def planes_seen_flat(spots: Spots) -> list[int]:
     flat = []
     for p in range(spots.plane_count):
         xy = spots.xy[spots.on_plane(p)]
-        s = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
-        if len(xy) < 3 or s[1] <= FLATTEST_IMAGE * s[0]:
-            flat.append(p)
+        if len(xy) >= 3:
+            s = np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)
+            if s[1] > FLATTEST_IMAGE * s[0]:
+                continue
+        flat.append(p)
     return flat
 
 

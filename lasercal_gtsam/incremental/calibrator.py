@@ -54,7 +54,7 @@ from lasercal_gtsam.robust import rejection_length
 
 # growth between attempts to find a first solution, and between repetitions of it while few spots
 # are there, up to this many
-_ATTEMPT_GROWTH, _AUDIT_GROWTH, _AUDITED = 1.05, 1.33, 300
+_ATTEMPT_GROWTH, _AUDIT_GROWTH, _AUDITED = 1.15, 1.33, 300
 # spots behind an alarm that must be there before anything is done by itself, up to which it is
 # looked into at each spot, then at every fifth, and up to which at all
 _FEWEST, _AT_EACH, _DIAGNOSED = 6, 20, 40

@@ -52,7 +52,7 @@ _SETTLED, _ROUNDS = 0.01, 8
 _GROWN = 1.25
 # an accepted step may raise the error by this many squared sigmas (rounding, marks)
 _WORSE = 1.0
-_LEVENBERG = 12
+_LEVENBERG, _RESTED = 12, 1.1
 # weight below which a fading spot is forgotten, and the least residual scale (exact data)
 _FADED, _MIN_SCALE = 1e-9, 1e-7
 
@@ -62,7 +62,7 @@ class _Linear:
     """Spots linearised at a point of the chart.
 
     ``H`` (n+1, n+1): their information; ``soft``: that of the priors which are not quadratic;
-    ``sums``: weight, squared pixels and loss, as `stream_kernels.accumulate` gives them.
+    ``sums`` (4,): as `stream_kernels.accumulate` gives them.
     """
 
     z: Array
@@ -226,6 +226,7 @@ class Filter:
         self.scale = scale
         self.robust = robust
         self.fallbacks = 0
+        self._rest_until = 0.0
         self._constraints = self._constrain()
         self._about = self._about_from = np.empty((0, 0))
         self._about_of: _Linear | None = None
@@ -240,7 +241,7 @@ class Filter:
         """The state of things, to be kept."""
         cost = float(self._R[-1, -1] ** 2)
         there = float(self._linear.H[-1, -1] + self._about[-1, -1])
-        weight, square, _ = self._linear.sums
+        weight, square = self._linear.sums[:2]
         square *= cost / there if there > 0 else 1.0
         return Estimate(
             self.chart, self.template, self.held, self.open, self.z, self._R,
@@ -289,6 +290,8 @@ class Filter:
 
     def settle(self) -> None:
         """Relinearise: at once where there are few spots, else a bounded share of it."""
+        if self.count < self._rest_until:
+            return
         if self.count <= FEW:
             self.relinearise(_SETTLED)
             return
@@ -396,7 +399,7 @@ class Filter:
         soft = np.zeros((size, size))
         if self._soft is not None:
             soft = self.scale**2 * self._soft(z)
-        return _Linear(z, view, np.zeros((size, size)), soft, np.zeros(3))
+        return _Linear(z, view, np.zeros((size, size)), soft, np.zeros(4))
 
     def _grown(self) -> bool:
         return self.count > _GROWN * self._judged
@@ -448,7 +451,7 @@ class Filter:
         self._pass = None
         before, after = self._loss(self._linear), self._loss(running.linear)
         if not after <= before + _WORSE * self.scale**2 + 1e-3 * before:
-            self._damped(before)
+            self._damped()
             return False
         self._accept(running)
         return True
@@ -460,7 +463,7 @@ class Filter:
         self._unknowns = self._count_unknowns()
         self._solve()
 
-    def _damped(self, loss: float) -> None:
+    def _damped(self) -> None:
         """Levenberg's way down from the point of linearisation, over all spots (cost linear)."""
         self.fallbacks += 1
         n = self.chart.n
@@ -472,20 +475,23 @@ class Filter:
             prior = about_point(self.prior, linear.z) + linear.soft + extra
             _, z = stream_kernels.estimate(linear.H, prior, linear.z, *self._constraints)
             trial = self._whole_pass(z)
-            found = self._loss(trial.linear)
-            if found < loss:
-                loss, damping = found, damping / 10.0
+            if self._loss(trial.linear) < self._loss(linear):
+                damping /= 10.0
                 self._accept(trial)
                 if self.moved <= _SETTLED:
                     return
             else:
                 damping *= 10.0
+        # no way down from here: more spots may show one, the same ones will not
+        self._rest_until = _RESTED * self.count
 
     def _loss(self, linear: _Linear) -> float:
+        """Truncated loss, by one limit for all linearisations that are compared."""
         if not np.isfinite(linear.H[0, 0]):
             return float("inf")
         prior = about_point(self.prior, linear.z)[-1, -1] + linear.soft[-1, -1]
-        return float(linear.sums[2] + prior)
+        left_out = self.limit**2 * linear.sums[3] if self.robust else 0.0
+        return float(linear.sums[2] + left_out + prior)
 
     def _solve(self) -> None:
         linear = self._linear

@@ -112,7 +112,8 @@ def test_accumulate_is_the_information_of_the_used_spots_in_the_chart(spots, cal
     )
     assert sums[0] == (mark == USED).sum()
     assert sums[1] == pytest.approx((pixels[mark == USED] ** 2).sum())
-    assert sums[2] == pytest.approx(np.minimum(lengths[5:], limit) @ np.minimum(lengths[5:], limit))
+    assert sums[2] == pytest.approx((lengths[mark == USED] ** 2).sum())
+    assert sums[3] == (mark == LEFT_OUT).sum()
 
 
 def test_fading_weighs_each_spot_by_those_that_came_after_it(spots, calibration):
