@@ -15,7 +15,6 @@ from lasercal_gtsam.cli.live import (
     Screen,
     alarm_words,
     moved_part,
-    sigma_words,
     spot_document,
     state_words,
 )
@@ -126,7 +125,7 @@ class Keeper:
             n = update.n_spots
             if n in _HEARTBEATS or n % _HEARTBEAT == 0:
                 self.screen.line(state_words(update))
-        self._show(update)
+        self.screen.status(lambda: _status(update))
         if update.events:
             self.save(now=True)
 
@@ -142,22 +141,6 @@ class Keeper:
         words = alarm_words(alarm, _HOW[self._conversation])
         self.screen.line(click.style(f"Alarm: {words}", fg=_RED))
 
-    def _show(self, update: Update) -> None:
-        if not self.screen.live:
-            return
-        if update.phase == "collecting":
-            self.screen.status(state_words(update))
-            return
-        text = (
-            f"{update.n_spots} spots, {update.n_used} used, RMS {update.rms_px:.3g} px, "
-            f"{sigma_words(update.parameters)}"
-        )
-        if update.alarm is not None:
-            text += click.style(", ALARM", fg=_RED, bold=True)
-        elif update.missing:
-            text += f", {update.missing[0].words}"
-        self.screen.status(text)
-
     def notice(self, notice: Notice) -> None:
         """Say what the follower has to say."""
         if self._as_json:
@@ -172,7 +155,7 @@ class Keeper:
         self.save(now=False)
         if waiting and self.session.calibrator.n_spots == self._began:
             name, why = next(iter(waiting.items()))
-            self.screen.status(f"waiting: {name}: {why}")
+            self.screen.status(lambda: f"waiting: {name}: {why}")
         self.screen.refresh()
 
     def print(self, document: Mapping[str, Any]) -> None:
@@ -235,3 +218,10 @@ class Keeper:
         self.screen.line(f"Ended: {'; '.join(words)}.")
         if calibrator.calibration is not None:
             self.screen.line(f"Saved {self._target}.")
+
+
+def _status(update: Update) -> str:
+    """The live line: an alarm where it is seen, before what is missing."""
+    if update.alarm is None:
+        return state_words(update)
+    return click.style("ALARM ", fg=_RED, bold=True) + state_words(update)

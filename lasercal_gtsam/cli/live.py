@@ -9,11 +9,13 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING, Any, Self
 
 import click
+
+from lasercal_gtsam.cli.texts import count
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Parameter
@@ -69,7 +71,8 @@ class Screen:
     def __init__(self, err: bool = False) -> None:
         self.live = sys.stderr.isatty()
         self._err = err
-        self._status, self._shown = "", ""
+        self._status: Callable[[], str] = str
+        self._shown = ""
         self._drawn = 0.0
 
     def __enter__(self) -> Self:
@@ -88,27 +91,28 @@ class Screen:
         self._wipe()
         click.echo(text, err=True)
 
-    def status(self, text: str) -> None:
-        """Let the live line say this; it is drawn at most every tenth of a second."""
+    def status(self, text: Callable[[], str]) -> None:
+        """Let the live line say this; it is asked and drawn at most every tenth of a second."""
         self._status = text
         if time.monotonic() - self._drawn > _REDRAW_S:
             self.refresh()
 
     def refresh(self) -> None:
         """Draw the live line as it should be."""
-        if not self.live or self._shown == self._status:
+        text = self._status() if self.live else ""
+        if text == self._shown:
             return
         self._wipe()
         width = shutil.get_terminal_size().columns - 1
-        plain = click.unstyle(self._status)
-        click.echo(self._status if len(plain) <= width else plain[:width], nl=False, err=True)
+        plain = click.unstyle(text)
+        click.echo(text if len(plain) <= width else plain[:width], nl=False, err=True)
         sys.stderr.flush()
-        self._shown, self._drawn = self._status, time.monotonic()
+        self._shown, self._drawn = text, time.monotonic()
 
     def close(self) -> None:
         """Remove the live line."""
         self._wipe()
-        self._status = ""
+        self._status = str
 
     def _wipe(self) -> None:
         if self._shown:
@@ -145,17 +149,13 @@ def sigma_words(parameters: Iterable[Parameter]) -> str:
 
 def state_words(update: Update) -> str:
     """Spots, RMS and largest sigma in one line; what is missing, where something is."""
+    parts = [count(update.n_spots, "spot")]
     if update.phase == "collecting":
-        missing = "; ".join(missing.words for missing in update.missing)
-        return f"{update.n_spots} spots, no estimate yet{': ' + missing if missing else ''}"
-    parts = [
-        f"{update.n_spots} spots",
-        f"{update.n_used} used",
-        f"RMS {update.rms_px:.3g} px",
-        sigma_words(update.parameters),
-        *(missing.words for missing in update.missing),
-    ]
-    return ", ".join(parts)
+        parts.append("no estimate yet")
+    else:
+        parts += [f"{update.n_used} used", f"RMS {update.rms_px:.3g} px"]
+        parts.append(sigma_words(update.parameters))
+    return ", ".join([*parts, *(missing.words for missing in update.missing)])
 
 
 def moved_part(alarm: Alarm) -> tuple[str, str] | None:

@@ -160,7 +160,7 @@ def watch(
             session,
             target,
             screen,
-            sources=_sources(said, start),
+            sources={**_digest(said), **session.sources},
             earlier=_earlier(session, target, start),
             conversation=from_stdin,
             as_json=as_json,
@@ -246,11 +246,10 @@ def _is_begun(journal: Path) -> bool:
         return False
 
 
-def _sources(said: _Head | None, start: Path | None) -> dict[str, str]:
+def _digest(said: _Head | None) -> dict[str, str]:
     from lasercal_gtsam.io.files import sha256_of
 
-    paths = [path for path in (said and said.path, start) if path is not None]
-    return {path.name: sha256_of(path) for path in paths}
+    return {} if said is None else {said.path.name: sha256_of(said.path)}
 
 
 def _earlier(
@@ -276,12 +275,13 @@ def _follow(
     keeper: Keeper, said: _Head, prefix: str, stop: Stopper, interval: float, limit: float | None
 ) -> tuple[bool, dict[str, str]]:
     """Take what comes until asked to stop (False) or nothing comes any more (True)."""
+    from lasercal_gtsam.incremental.journaled import THE_START, THIS_JOURNAL
     from lasercal_gtsam.io.follow import CaptureFollower, Notice
 
     session = keeper.session
     sigma_px = _sigma(session, said)
     follower = CaptureFollower(
-        said.path, session.known, where="this journal", prefix=prefix, sigma_px=sigma_px
+        said.path, session.known, where=THIS_JOURNAL, prefix=prefix, sigma_px=sigma_px
     )
     first, last = True, time.monotonic()
     while not stop.asked:
@@ -290,7 +290,7 @@ def _follow(
             if isinstance(item, Notice):
                 if first and item.kind == "file":
                     raise DataError(item.words)
-                if first and item.kind == "changed" and not session.replayed:
+                if item.kind == "changed" and session.known.where(item.id) == THE_START:
                     raise DataError(item.words, "... --prefix gives all rows new ids")
                 keeper.notice(item)
             else:

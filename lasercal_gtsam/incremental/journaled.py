@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]
 
+THE_START, THIS_JOURNAL = "the start", "this journal"  # where spots are, for messages
 SPOT, RESET, DISMISS = "spot", "reset", "dismiss"
 
 
@@ -45,6 +46,7 @@ class JournaledCalibrator:
     calibrator : the running calibration; to be read only
     known : all spots of the start and of the journal
     start : the calibration it began with, or None
+    sources : the name of its copy, and its SHA-256
     image_size : of all cameras so far: name to (width, height), pixels
     replayed : how many records the journal had
     repaired : what was cut off from the end of the journal, as a sentence, or None
@@ -68,6 +70,10 @@ class JournaledCalibrator:
         self.path = Path(path)
         wanted = _About(start, options, dict(settings or {}))
         self._journal = Journal.open(self.path, wanted.header)
+        if not self._journal.count and wanted.replaces(self._journal.about):
+            self._journal.close()
+            self.path.unlink()  # nothing has come since it was begun another way
+            self._journal = Journal.open(self.path, wanted.header)
         try:
             self._open(wanted, progress)
         except BaseException:
@@ -79,13 +85,14 @@ class JournaledCalibrator:
         about = self._journal.about
         wanted.check(about, self.path)
         self.start = self._load_start(about.get("start"), wanted.start, copy)
+        self.sources = {} if self.start is None else {copy.name: about["start"]}
         options = None if self.start is not None else wanted.options
         self.calibrator = IncrementalCalibrator(self.start, options, **wanted.settings)
         self.known = KnownSpots()
         self.image_size: dict[str, tuple[int, int]] = {}
         self._lasers: dict[str, None] = {}
         if self.start is not None:
-            self._note(self.start.inputs.observations, "the start")
+            self._note(self.start.inputs.observations, THE_START)
         self.repaired = self._journal.repaired
         self.replayed = 0
         for record in JournalReader(self.path):
@@ -110,7 +117,7 @@ class JournaledCalibrator:
     def _replay(self, kind: str, payload: Mapping[str, Any], seq: int) -> None:
         if kind == SPOT:
             spot = observations_from(payload)
-            self._note(spot, "this journal")
+            self._note(spot, THIS_JOURNAL)
             try:
                 self.calibrator.add(spot)
             except LasercalError:
@@ -160,7 +167,7 @@ class JournaledCalibrator:
             self.check_sizes(spot.image_size)
         self._journal.append_many((SPOT, spots_payload(spot)) for spot in spots)
         for spot in spots:
-            self._note(spot, "this journal")
+            self._note(spot, THIS_JOURNAL)
         return self._take(spots)
 
     def _take(self, spots: Iterable[Observations]) -> Iterator[Update | LasercalError]:
@@ -212,6 +219,14 @@ class _About:
             "options": plain(self.options) if self.start is None else None,
             **settings,
         }
+
+    def replaces(self, about: Mapping[str, Any]) -> bool:
+        """Whether a journal without a record, begun another way, may be begun anew.
+
+        Not one whose start is not named again: that would be lost.
+        """
+        begun = about.get("start")
+        return dict(about) != self.header and (self.start is not None or begun is None)
 
     def check(self, about: Mapping[str, Any], path: Path) -> None:
         """Raise `DataError` where a journal was begun another way, with every difference."""

@@ -142,7 +142,7 @@ def test_from_nothing_to_a_calibration_and_on(lasercal, growing, rows):
     assert outcome.status == 0
     assert outcome.err == ""
     lines = outcome.out.splitlines()
-    assert lines[0].startswith("1 spots, no estimate yet: at least 15 spots are needed")
+    assert lines[0].startswith("1 spot, no estimate yet, at least 15 spots are needed")
     assert re.fullmatch(r"\d+ spots: started: with \d+ spots, RMS [01]\.\d+ px", lines[2])
     assert lines[-2].startswith("Ended: 30 spots taken, 30 in all; waiting: poses.csv:32: the last")
     assert lines[-1] == f"Saved {growing / 'calibration.json'}."
@@ -180,7 +180,7 @@ def test_a_start_goes_on_and_its_rows_are_not_taken_again(lasercal, growing, row
     first = lc.load_calibration(result)
     assert differences(first, uninterrupted()) < 1e-9
     saved = json.loads(result.read_text())["provenance"]["files"]
-    assert set(saved) == {"capture.yaml", "calibration.json"}
+    assert set(saved) == {"capture.yaml", "calibration.journal.jsonl.start"}
     # the same command goes on from the copy that the journal has of its start
     outcome = lasercal("watch", growing, "--calibration", result, "--once", "--interval", "0.01")
     assert "Ended: 0 spots taken" in outcome.out
@@ -341,7 +341,7 @@ def test_an_alarm_names_the_cause_and_what_to_do(lasercal, growing, tmp_path):
 
 
 def test_refusals_are_one_clear_line(lasercal, growing, rows, tmp_path):
-    append(growing, *rows[1:10])
+    append(growing, *rows[1:10], rows[START + 1])
     begin = ("--calibration", tmp_path / "start.json")
     start().save(growing / "calibration.json")
 
@@ -372,6 +372,12 @@ def test_refusals_are_one_clear_line(lasercal, growing, rows, tmp_path):
     head = growing / "capture.yaml"
     head.write_text(head.read_text().replace("pixel: 1.0", "pixel: 0.5"))
     assert "option sigma_px was 1.0, now it is 0.5" in refused(growing, *out)
+    # where nothing has come yet, a journal may be begun another way
+    (growing / "poses.csv").write_bytes(rows[0])
+    empty = ("watch", growing, "-o", tmp_path / "empty.json", "--once")
+    assert lasercal(*empty).status == 0
+    assert lasercal(*empty, "--automatic").status == 0
+    assert JournalReader(tmp_path / "empty.journal.jsonl").about["automatic"] is True
     head.write_text(head.read_text().replace("width: 640", "width: 641"))
     assert "image size 641 x 480, but it was 640 x 480" in refused(growing)
 
