@@ -137,17 +137,19 @@ class Estimate:
         scale = scale if np.isfinite(scale) and scale > 0 else 1.0
         information = carried(H, self.chart, self.z, state) / scale**2
         return Belief(
-            cell_from_state(state, self.template), information, self._fixed(), self._aspect
+            cell_from_state(state, self.template), information, self.fixed, self._aspect
         )
 
     def covariance(self) -> Array:
         """(n, n) in the tangent coordinates of `cell`, scaled by ``sigma0``.
 
-        Zero for constants, NaN for what is not determined yet and where there is no scale.
+        Zero for constants, NaN for what is not determined yet and where there is no scale; all NaN
+        where some combination is not determined.
         """
-        fixed = self._fixed() | self.open
+        fixed = self.fixed | self.open
         free = np.flatnonzero(~fixed)
-        root = np.linalg.inv(self.R[np.ix_(free, free)])
+        R = self.R[np.ix_(free, free)]
+        root = np.linalg.inv(R) if np.all(np.diag(R) > 0) else np.full_like(R, np.nan)
         E = expansion(self.template, fixed, self._aspect)
         J = cell_tangent_map(self.chart, self.z, self.state) @ E @ root
         covariance = np.asarray(self.sigma0**2 * J @ J.T)
@@ -161,7 +163,8 @@ class Estimate:
         pairs = zip(self.template.cameras, self.chart.aspects, strict=True)
         return {name: aspect for name, aspect in pairs if aspect is not None}
 
-    def _fixed(self) -> Mask:
+    @property
+    def fixed(self) -> Mask:
         """Constants, and the focal lengths that follow others."""
         fixed = self.held.copy()
         fixed[15 * np.flatnonzero(~np.isnan(self.chart.aspect_array)) + 6] = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +21,7 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, pixel_covariances, state_from_cell
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
 from lasercal_gtsam.incremental.filter import Estimate
-from lasercal_gtsam.observability import RangeSvd
+from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import project
@@ -96,11 +97,16 @@ def calibration_of(
     for k in account.waiting:
         rejected[k - first] = "held back: it waits for more spots, or for the end of an alarm"
     used = np.array([reason is None for reason in rejected], dtype=np.bool_)
-    fit = _fit(estimate, account, residuals[used], int((~used).sum()), unit)
+    svd = RangeSvd.of(estimate.R[:-1, :-1], uncertainty.labels, ~(estimate.fixed | estimate.open))
+    undetermined = [
+        f"the spots do not determine this combination: {w.words}"
+        for w in svd.weak_directions(SINGULAR, sigma=estimate.sigma0)
+    ]
+    troubles = [*account.troubles, *undetermined]
+    fit = _fit(estimate, account, troubles, residuals[used], int((~used).sum()), unit)
     notes = [*fold_warnings(cell), *report_notes(cell, uncertainty)]
     if account.older:
         notes.append(f"{account.older} older spots live on as prior knowledge only")
-    svd = RangeSvd.of(estimate.R[:-1, :-1], uncertainty.labels, ~(estimate.held | estimate.open))
     return Calibration(
         cell=cell,
         initial=account.initial,
@@ -160,11 +166,16 @@ def _reason(length: float, limit: float) -> str:
 
 
 def _fit(
-    estimate: Estimate, account: Account, residuals: Array, n_rejected: int, unit: float
+    estimate: Estimate,
+    account: Account,
+    troubles: Sequence[str],
+    residuals: Array,
+    n_rejected: int,
+    unit: float,
 ) -> Fit:
     rms = rms_px(residuals) if len(residuals) else estimate.rms_px
-    if account.troubles:
-        status = "not to be trusted: " + "; ".join(account.troubles)
+    if troubles:
+        status = "not to be trusted: " + "; ".join(troubles)
     else:
         status = f"running: {len(residuals) + account.older} spots, RMS {rms:.3g} px"
         if n_rejected:
@@ -176,7 +187,7 @@ def _fit(
         sigma0=unit * estimate.sigma0,
         dof=estimate.dof,
         iterations=1,
-        converged=not account.troubles,
+        converged=not troubles,
         status=status,
         n_spots=len(residuals) + account.older,
         n_rejected=n_rejected,

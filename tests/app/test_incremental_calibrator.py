@@ -37,6 +37,10 @@ def agrees(calibrator, observations, options, sigmas=0.01):
     assert result.fit.rms_px == pytest.approx(batch.fit.rms_px, rel=1e-3)
     assert result.fit.n_spots == batch.fit.n_spots
     assert result.fit.dof == pytest.approx(batch.fit.dof, abs=0.01)
+    assert result.fit.converged and not result.fit.status.startswith("not")
+    assert [w.words[:12] for w in result.observability.weak] == [
+        w.words[:12] for w in batch.observability.weak
+    ]
     assert [r is None for r in result.spots.rejected] == [r is None for r in batch.spots.rejected]
     return batch, result
 
