@@ -24,6 +24,7 @@ from lasercal_gtsam.hand_noise import refine_with_hand_noise
 from lasercal_gtsam.holds import Holds, resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.reweight import refine_truncated, refine_with_loss
 from lasercal_gtsam.robust import (
     Accepted,
     Finished,
@@ -44,6 +45,9 @@ from lasercal_gtsam.uncertainty import (
 
 if TYPE_CHECKING:
     from lasercal_gtsam.closed_form import Candidate
+
+# weight of a spot that hardly counts, worth a word in the status
+_FAINT = 0.1
 
 
 def calibrate(
@@ -89,11 +93,15 @@ def calibrate(
             return Finished(*refine_with_hand_noise(search, solution, rejected))
         return Finished(solution, lengths_of(search, solution.cell))
 
-    if options.robust == "auto":
-        accepted = refine_without_outliers(search, ways, finish)
-    else:
+    if options.robust == "none":
         finished = finish(ways.refine(search, ways.starts), np.zeros(len(batch), np.bool_))
         accepted = Accepted(finished, (None,) * len(batch), ways.starts[0])
+    else:
+        accepted = refine_without_outliers(search, ways, finish)
+    if options.robust == "gnc-tls":
+        accepted = refine_truncated(search, accepted, ways.refine, finish)
+    elif options.robust not in ("auto", "none"):
+        accepted = refine_with_loss(search, accepted, options.robust)
     if initial is not None:
         accepted = accepted._replace(start=initial)
     return assemble(search, accepted)
@@ -153,16 +161,17 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
     The residuals refer to the spots as observed, with the commanded hand poses.
     """
     observations, options, batch = search.observations, search.options, search.batch
-    (solution, _, sigma_px), reasons, start = accepted
+    (solution, _, sigma_px), reasons, start, weights = accepted
     uncertainty = estimate_uncertainty(solution)
-    if sigma_px is not None:  # found with the robot's noise; what is left of the scale is about 1
+    if sigma_px is not None:  # found on the way; what is left of the scale is about 1
         uncertainty = replace(uncertainty, sigma0=sigma_px * uncertainty.sigma0)
     problem = solution.problem
     cell = _with_unobserved(solution.cell, start)
     residuals = batch.residuals(state_from_cell(solution.cell))
     used = np.array([reason is None for reason in reasons])
+    weights = used.astype(np.float64) if weights is None else weights
     warnings = fold_warnings(solution.cell)
-    fit = _fit(solution, uncertainty, residuals[used], int((~used).sum()), warnings)
+    fit = _fit(solution, uncertainty, residuals[used], weights[used], int((~used).sum()), warnings)
     notes = (*warnings, *report_notes(solution.cell, uncertainty))
     return Calibration(
         cell=cell,
@@ -177,8 +186,9 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
             observations.camera,
             observations.laser,
             residuals,
-            used.astype(np.float64),
+            weights,
             reasons,
+            uncertainty.leverage,
         ),
         observability=Observability(uncertainty.weak, problem.holds.words, notes),
         inputs=Inputs(observations, options),
@@ -189,10 +199,11 @@ def _fit(
     solution: Solution,
     uncertainty: Uncertainty,
     residuals: Array,
+    weights: Array,
     n_rejected: int,
     warnings: list[str],
 ) -> Fit:
-    rms = rms_px(residuals)
+    rms = rms_px(residuals * np.sqrt(weights / weights.mean())[:, None])
     if solution.troubles:
         status = "not to be trusted: " + "; ".join(solution.troubles)
     else:
@@ -202,6 +213,8 @@ def _fit(
         )
         if n_rejected:
             status += f", {n_rejected} rejected as outliers"
+        if faint := int((weights < _FAINT).sum()):
+            status += f", {faint} with a weight below {_FAINT:g}"
         if uncertainty.dof < 1:
             status += "; no degrees of freedom left, so no sigmas: add spots"
         if warnings:
@@ -243,11 +256,6 @@ def _check_request(
         raise DataError("calibrate: there are no spots")
     if initial is not None and not isinstance(initial, Cell):
         raise DataError(f"initial: expected a Cell, got {type(initial).__name__}")
-    if options.robust not in ("auto", "none"):
-        raise DataError(
-            f"options.robust: {options.robust!r} is not available yet; use 'auto' (outliers are "
-            "found, named and left out) or 'none'"
-        )
     if options.distortion == "auto":
         raise DataError(
             "options.distortion: 'auto' is not available yet; use 'all', 'none' or names out of "

@@ -37,7 +37,8 @@ class Fit:
 
     Attributes
     ----------
-    rms_px : root of the mean squared distance between seen and predicted spot (the paper's RMS)
+    rms_px : root of the mean squared distance between seen and predicted spot (the paper's RMS),
+        over the spots that were not rejected, by their weights
     sigma0 : a-posteriori scale: pixel sigma (px) where none was given, else a factor on the given
     dof : degrees of freedom behind ``sigma0`` (0: no sigma can be stated)
     iterations : Levenberg-Marquardt iterations of the last solve
@@ -58,7 +59,18 @@ class Fit:
 
 @dataclass(frozen=True)
 class SpotResult:
-    """The account of one spot: residual ``predicted - seen`` (px), weight, why it was rejected."""
+    """The account of one spot.
+
+    Attributes
+    ----------
+    residual_px : ``predicted - seen`` (px)
+    weight : with which it counts in the fit, 0 to 1; the loss's where one was asked for
+    rejected : why it was left out; None if it was not
+    leverage : how much of the spot's two coordinates the fit takes from the spot itself, 0 to 2
+        (the diagonal of the hat matrix, summed over both); near 2 nothing checks the spot. Summed
+        over all spots it is the number of unknowns that the spots determine; 0 for a spot left
+        out, NaN where it is not known
+    """
 
     id: str
     plane: str
@@ -67,6 +79,7 @@ class SpotResult:
     residual_px: tuple[float, float]
     weight: float
     rejected: str | None
+    leverage: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,10 +93,13 @@ class SpotResults(FrozenData):
     residual_px: Array
     weight: Array
     rejected: tuple[str | None, ...]
+    leverage: Array | None = None
 
     def __post_init__(self) -> None:
         n = len(set_array(self, "residual_px", self.residual_px, (None, 2), finite=False))
         set_array(self, "weight", self.weight, (n,))
+        leverage = np.full(n, np.nan) if self.leverage is None else self.leverage
+        set_array(self, "leverage", leverage, (n,), finite=False)
 
     def __len__(self) -> int:
         return len(self.residual_px)
@@ -97,6 +113,7 @@ class SpotResults(FrozenData):
             residual_px=(float(self.residual_px[k, 0]), float(self.residual_px[k, 1])),
             weight=float(self.weight[k]),
             rejected=self.rejected[k],
+            leverage=float("nan") if self.leverage is None else float(self.leverage[k]),
         )
 
     def __iter__(self) -> Iterator[SpotResult]:

@@ -60,9 +60,13 @@ class RangeSvd:
         values = np.append(values, np.zeros(len(names) - len(values)))
         return cls(values, Vt, ranges, names)
 
+    def root(self) -> Array:
+        """(m, m) square root of the covariance; all singular values must be positive."""
+        return np.asarray(self.directions.T / self.values * self.ranges[:, None])
+
     def covariance(self) -> Array:
         """(m, m) inverse of the information; all singular values must be positive."""
-        root = self.directions.T / self.values * self.ranges[:, None]
+        root = self.root()
         return np.asarray(root @ root.T)
 
     def weak_directions(

@@ -26,7 +26,11 @@ class CalibrationOptions:
     hand_sigma_m, hand_sigma_rad
         Robot noise of a commanded hand pose, 1 sigma per axis (metres, radians).
     robust
-        Loss on the whitened residual length of a spot.
+        What is done about outliers. ``"auto"``: looked for with a redescending loss, named and left
+        out, then least squares; on clean data plain least squares to the last digit.
+        ``"gnc-tls"``: the same by graduated truncated least squares. ``"huber"``, ``"cauchy"``,
+        ``"geman-mcclure"``: none left out, each weighed by that loss on the length of its whitened
+        residual, at 95 % efficiency on clean data. ``"none"``: least squares on all spots.
     distortion
         Which distortion terms are estimated: ``"all"``, ``"none"``, ``"auto"`` or names out of
         ``k1 k2 p1 p2``; the others are held at the start's value (zero without one).

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from lasercal_factors.batch import Loss
+from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
@@ -60,14 +60,18 @@ Finish = Callable[[Solution, Mask], Finished]
 
 
 class Accepted(NamedTuple):
-    """The answer: finished, for each spot None or why it was rejected, and where it began."""
+    """The answer: finished, for each spot None or why it was rejected, and where it began.
+
+    ``weights`` (N,): with which spots count; None: all that were not rejected fully.
+    """
 
     finished: Finished
     reasons: tuple[str | None, ...]
     start: Cell
+    weights: Array | None = None
 
 
-# threshold at which the Cauchy loss is 95 % efficient for two-dimensional Gaussian residuals
+# threshold of the Cauchy loss while outliers are looked for; the usual one, 94 % efficient here
 CAUCHY_THRESHOLD = 2.385
 # probability that any spot of a clean capture is rejected
 FALSE_ALARM = 1e-3
@@ -140,10 +144,12 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
     if ways.parts is not None and not (isinstance(plain, Finished) and clean):
         best = _sampled(search, ways.parts, best)
     if best is not None:
-        answer = _refit(search, best, ways.refine, finish)
+        answer = refit(search, best, ways.refine, finish)
         if answer is not None and answer[1].any():
             finished, rejected = answer
-            return Accepted(finished, _reasons(search, finished.lengths, rejected), best.start)
+            return Accepted(
+                finished, outlier_reasons(search, finished.lengths, rejected), best.start
+            )
     plain = plain or _plain(search, ways, finish)
     if not isinstance(plain, Finished):
         raise plain
@@ -168,7 +174,12 @@ def _plain(search: Search, ways: Ways, finish: Finish) -> Finished | LasercalErr
 
 def lengths_of(search: Search, cell: Cell) -> Array:
     """Whitened residual length (sigmas) of every spot, (N,); infinite where no spot can be."""
-    lengths = search.batch.whitened_lengths(state_from_cell(cell))
+    return lengths_in(search.batch, cell)
+
+
+def lengths_in(batch: SpotBatch, cell: Cell) -> Array:
+    """The same for the spots of a batch."""
+    lengths = batch.whitened_lengths(state_from_cell(cell))
     return np.where(np.isnan(lengths), np.inf, lengths)
 
 
@@ -307,7 +318,7 @@ def _sampled(
     return best
 
 
-def _refit(
+def refit(
     search: Search, best: Consensus, refine: Refine, finish: Finish
 ) -> tuple[Finished, Mask] | None:
     """Plain least squares without the outliers, until the same spots stay out.
@@ -353,7 +364,8 @@ def _unknowns(search: Search) -> int:
     return int((~search.holds.held).sum())
 
 
-def _reasons(search: Search, lengths: Array, rejected: Mask) -> tuple[str | None, ...]:
+def outlier_reasons(search: Search, lengths: Array, rejected: Mask) -> tuple[str | None, ...]:
+    """For each spot why it was rejected, None if it was not."""
     limit = rejection_length(len(lengths))
     scale = robust_scale(lengths[~rejected], _unknowns(search))
     words = [

@@ -6,16 +6,21 @@ which also names the weak directions. It equals `gtsam.Marginals` (tested), bett
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from lasercal_factors.batch import Loss
 
 from lasercal_gtsam.calibration import Parameter, WeakDirection
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph, beam_frames
+from lasercal_gtsam.graph import CellGraph, beam_frames, state_from_cell
+from lasercal_gtsam.losses import loss_weights, sensitivity_and_spread
+from lasercal_gtsam.observability import RangeSvd
 from lasercal_gtsam.report_map import (
+    BEAM_TANGENT,
     CAMERA_TANGENT,
+    PLANE_TANGENT,
     BeamChart,
     row_jacobian,
     row_names,
@@ -47,6 +52,7 @@ class Uncertainty:
     sigma0 : a-posteriori scale of the pixel sigmas
     dof : degrees of freedom behind ``sigma0``
     weak : directions which the data hardly determine
+    leverage : (N,) of each spot, see `SpotResult`; None where nobody asked
     """
 
     covariance: Array
@@ -54,12 +60,15 @@ class Uncertainty:
     sigma0: float
     dof: float
     weak: tuple[WeakDirection, ...]
+    leverage: Array | None = None
 
 
 def estimate_uncertainty(solution: Solution) -> Uncertainty:
     """Covariance at a solution, scaled by the residuals (method 5: ``s0^2 = SSE / dof``).
 
-    Held coordinates have zero rows; tied focal lengths move together.
+    With a loss the spots must be whitened to a scale of one; ``sigma0`` is then one, and the
+    covariance is Huber's (`losses.sensitivity_and_spread`). Held coordinates have zero rows; tied
+    focal lengths move together.
 
     Raises
     ------
@@ -70,14 +79,75 @@ def estimate_uncertainty(solution: Solution) -> Uncertainty:
     values = problem.start_values()
     svd = refuse_if_singular(problem, values)
     dof = degrees_of_freedom(problem, values)
-    sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
-    unit = sigma0 / problem.scale
     E = _expansion(problem)
-    covariance = E @ (unit**2 * svd.covariance()) @ E.T
+    if problem.loss.name == "none":
+        sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
+        unit = sigma0 / problem.scale
+        free, weak_of = unit**2 * svd.covariance(), svd
+    else:
+        sigma0 = 1.0 if dof >= 1 else float("nan")
+        free, unit, weak_of = _robust_covariance(problem, sigma0)
+    covariance = E @ free @ E.T
     covariance[~E.any(axis=1)] = 0.0  # what is held has none, even where the scale is unknown
     covariance[:, ~E.any(axis=1)] = 0.0
-    weak = svd.weak_directions(sigma=unit if unit > _EXACT else 1.0)
-    return Uncertainty(covariance, tangent_labels(solution.cell), sigma0, dof, weak)
+    weak = weak_of.weak_directions(sigma=unit if unit > _EXACT else 1.0)
+    leverage = spot_leverages(problem, E @ svd.root())
+    return Uncertainty(covariance, tangent_labels(solution.cell), sigma0, dof, weak, leverage)
+
+
+def _robust_covariance(problem: CellGraph, sigma0: float) -> tuple[Array, float, RangeSvd]:
+    """Covariance of the free coordinates, its scale, and the unweighted information.
+
+    With ``D`` the rows of the spots and ``P`` the information of the priors it is
+    ``A^-1 (b D^T D + P) A^-1`` with ``A = a D^T D + P``.
+    """
+    residuals = problem.batch.rows(state_from_cell(problem.start))[problem.batch.used, :, -1]
+    unknowns = float(problem.free.sum())
+    a, b = sensitivity_and_spread(problem.loss, residuals, unknowns)
+    plain = replace(problem, loss=Loss())
+    R = plain.rows(plain.start_values())
+    labels = tangent_labels(problem.start)
+    unit = float(np.sqrt(b)) / a * sigma0
+    svd = RangeSvd.of(R, labels, problem.free)
+    if not problem.holds.priors:
+        return unit**2 * svd.covariance(), unit, svd
+    data = len(R) - len(problem.holds.priors)
+    weights = np.where(np.arange(len(R)) < data, np.sqrt(a), 1.0)
+    inverse = RangeSvd.of(weights[:, None] * R, labels, problem.free).covariance()
+    D = R[:data, problem.free]
+    # A^-1 (A + (b - a) D^T D) A^-1
+    return sigma0**2 * (inverse + (b - a) * (inverse @ D.T) @ (D @ inverse)), unit, svd
+
+
+def spot_leverages(problem: CellGraph, root: Array) -> Array:
+    """Leverage of every spot, (N,): its rows of the hat matrix's diagonal, summed; 0 if left out.
+
+    Parameters
+    ----------
+    problem : its chart about the solution
+    root : (n, m) square root of the covariance of all coordinates, spots at their stated sigmas
+    """
+    batch = problem.batch
+    rows = batch.rows(state_from_cell(problem.start)) / problem.scale
+    rows[..., 21] *= -1.0  # the kernels' offset of a plane is minus its distance
+    if problem.loss.name != "none":
+        m = np.einsum("ni,ni->n", rows[..., -1], rows[..., -1])
+        rows *= np.sqrt(loss_weights(problem.loss, m))[:, None, None]
+    sizes = (len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT))
+    lasers = sizes[0] * len(problem.start.cameras)
+    planes = lasers + sizes[1] * len(problem.start.lasers)
+    out = np.zeros(len(batch))
+    for c, l, p, first, last in batch.spots.blocks:  # noqa: E741
+        at = np.concatenate(
+            [
+                begin + size * index + np.arange(size)
+                for begin, size, index in zip((0, lasers, planes), sizes, (c, l, p), strict=True)
+            ]
+        )
+        members = batch.order[first:last]
+        parts = rows[members, :, :-1].reshape(-1, len(at)) @ root[at]
+        out[members] = np.square(parts).sum(axis=1).reshape(-1, 2).sum(axis=1)
+    return out
 
 
 def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tuple[Parameter, ...]:

@@ -65,10 +65,12 @@ CALIBRATION_FILE = "calibration.json"
 )
 @click.option(
     "--robust",
-    type=click.Choice(["auto", "none"]),
+    type=click.Choice(["auto", "none", "huber", "cauchy", "geman-mcclure", "gnc-tls"]),
     default="auto",
     show_default=True,
-    help="Whether outliers are looked for, named and left out.",
+    help="What is done about outliers. auto and gnc-tls (graduated truncated least squares) name "
+    "them and leave them out; huber, cauchy and geman-mcclure weigh every spot by that loss; none "
+    "is plain least squares.",
 )
 @click.option(
     "--sigma-px",

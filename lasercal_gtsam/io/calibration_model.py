@@ -233,6 +233,7 @@ class SpotModel(_Part):
     residual_px: Vector2
     weight: Number
     rejected: str | None
+    leverage: Number = math.nan  # unknown to older files
 
 
 class WeakModel(_Part):
@@ -344,6 +345,7 @@ class CalibrationModel(CellModel):
             residual_px=np.array([s.residual_px for s in self.spots]).reshape(-1, 2),
             weight=np.array([s.weight for s in self.spots]),
             rejected=tuple(s.rejected for s in self.spots),
+            leverage=np.array([s.leverage for s in self.spots]),
         )
 
 
