@@ -22,7 +22,7 @@ from lasercal_gtsam.io.capture_head import read_head
 from lasercal_gtsam.io.capture_rows import USED, Rows, rows_of, spot_pixels
 from lasercal_gtsam.io.files import sha256_of
 from lasercal_gtsam.io.follow_pictures import Detector, Fault, PictureDesk, Wait
-from lasercal_gtsam.io.follow_tables import CaptureTables, NewRow, at_line
+from lasercal_gtsam.io.follow_tables import CaptureTables, NewRow, at_line, without_repeats
 from lasercal_gtsam.io.growing import Clock
 from lasercal_gtsam.io.known_spots import KnownSpots
 from lasercal_gtsam.io.tables import Row, Table
@@ -198,7 +198,7 @@ class CaptureFollower:
             self._pictured.pop(label, None)
             self._unjudged[label] = None
         for name, rows in taken.items():
-            for part in _without_repeats(rows):
+            for part in without_repeats(rows):
                 yield from self._compare(name, part)
 
     def _has(self, name: str, label: str) -> bool:
@@ -275,14 +275,18 @@ class CaptureFollower:
             table = self._tables.poses(rows)
             same = self._same_poses(table)
         else:
-            table = self._tables.spots(rows) or self._tables.poses([])
-            same = self._same_pixels(table, labels)
+            spots = self._tables.spots(rows)
+            assert spots is not None
+            table, same = spots, self._same_pixels(spots, labels)
         wrong = table.problems_by_line()
-        for label, line, agrees in zip(labels, table.lines, same, strict=True):
+        verdicts = table.columns.get("verdict", [""] * len(table))
+        for label, line, agrees, verdict in zip(labels, table.lines, same, verdicts, strict=True):
             if agrees and line not in wrong:
                 continue
             full = self._prefix + label
-            what = "; ".join(wrong.get(line, ["other values"]))
+            taken_back = verdict.lower() not in ("", USED)
+            other = f"verdict {verdict!r}" if taken_back else "other values"
+            what = "; ".join(wrong.get(line, [other]))
             text = (
                 f"id {label!r}: {what}, but this spot is in {self._known.where(full)} already and "
                 "stays there as it is; a new spot needs an id of its own"
@@ -310,10 +314,14 @@ class CaptureFollower:
         uv, cov = spot_pixels(table, [None] * len(table))
         if self._sigma_px is not None:
             cov[np.isnan(cov).any(axis=(1, 2))] = self._sigma_px**2 * np.eye(2)
-        given = [bool(np.isfinite(pixel).all()) for pixel in uv]
         names = [self._prefix + label for label in labels]
         same = self._known.same_pixels(names, np.nan_to_num(uv), cov)
-        return [agrees or not has for agrees, has in zip(same, given, strict=True)]
+        verdicts = table.columns.get("verdict", [""] * len(table))
+        # without a pixel and a verdict a row says nothing
+        return [
+            agrees if verdict.lower() == USED else not verdict and (agrees or np.isnan(pixel).any())
+            for agrees, verdict, pixel in zip(same, verdicts, uv, strict=True)
+        ]
 
     # --- pictures, ends, words ------------------------------------------------------------------
 
@@ -387,18 +395,3 @@ def _words(rows: Rows, k: int) -> dict[str, str]:
         "camera": rows.cameras[k],
         "laser": rows.lasers[k],
     }
-
-
-def _without_repeats(rows: Sequence[tuple[str, Row]]) -> Iterator[list[tuple[str, Row]]]:
-    """The rows in parts, in each of which no id comes twice."""
-    rest = list(rows)
-    while rest:
-        part: dict[str, tuple[str, Row]] = {}
-        later = []
-        for item in rest:
-            if item[0] in part:
-                later.append(item)
-            else:
-                part[item[0]] = item
-        yield list(part.values())
-        rest = later

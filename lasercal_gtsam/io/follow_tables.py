@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -150,3 +150,18 @@ class CaptureTables:
 def at_line(name: str, line: int, text: str) -> str:
     """A message with its place; line 0 is the file as a whole."""
     return f"{name}:{line}: {text}" if line else f"{name}: {text}"
+
+
+def without_repeats(rows: Sequence[tuple[str, Row]]) -> Iterator[list[tuple[str, Row]]]:
+    """The rows in parts, in each of which no id comes twice."""
+    rest = list(rows)
+    while rest:
+        part: dict[str, tuple[str, Row]] = {}
+        later = []
+        for item in rest:
+            if item[0] in part:
+                later.append(item)
+            else:
+                part[item[0]] = item
+        yield list(part.values())
+        rest = later

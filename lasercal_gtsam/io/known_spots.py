@@ -4,30 +4,24 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.observations import Observations
 
+_DIGEST = 8  # bytes
 # The same number may differ in its last digits after another way through files.
 _DECIMALS_POSE, _DECIMALS_PX, _DIGITS_SIGMA = 9, 6, 6
 
 
-class _Known(NamedTuple):
-    """One spot as digests: who and which pose, which pixel; and where it is."""
-
-    pose: bytes
-    pixel: bytes
-    where: str
-
-
 class KnownSpots:
-    """Spots by id, small: a few digests each."""
+    """Spots by id, small: two digests each (who and which pose; which pixel) and where it is."""
 
     def __init__(self) -> None:
-        self._spots: dict[str, list[_Known]] = {}
+        # one record after the other where an id is there more than once
+        self._spots: dict[str, bytes] = {}
+        self._places: list[str] = []
 
     def __len__(self) -> int:
         return len(self._spots)
@@ -37,19 +31,22 @@ class KnownSpots:
 
     def add(self, observations: Observations, where: str) -> None:
         """Remember spots; ``where`` says for messages where they are ("calibration.json")."""
+        if where not in self._places:
+            self._places.append(where)
+        place = bytes([self._places.index(where)])
         poses, pixels = _poses(observations), _pixels(observations.uv, observations.cov_uv)
         for name, pose, pixel in zip(observations.id.tolist(), poses, pixels, strict=True):
-            self._spots.setdefault(name, []).append(_Known(pose, pixel, where))
+            self._spots[name] = self._spots.get(name, b"") + pose + pixel + place
 
     def where(self, name: str) -> str:
         """Where a spot of that id is."""
-        return self._spots[name][0].where
+        return self._places[self._spots[name][2 * _DIGEST]]
 
     def same_poses(self, observations: Observations) -> list[bool]:
         """Whether each spot has pose, camera, laser and plane of the one known by its id."""
         poses = _poses(observations)
         return [
-            any(known.pose == pose for known in self._spots[name])
+            any(known[:_DIGEST] == pose for known in self._known(name))
             for name, pose in zip(observations.id.tolist(), poses, strict=True)
         ]
 
@@ -57,7 +54,7 @@ class KnownSpots:
         """Whether each spot has pixel and covariance of the one known by its id."""
         pixels = _pixels(uv, cov_uv)
         return [
-            any(known.pixel == pixel for known in self._spots[name])
+            any(known[_DIGEST:] == pixel for known in self._known(name))
             for name, pixel in zip(names, pixels, strict=True)
         ]
 
@@ -65,9 +62,14 @@ class KnownSpots:
         """Whether each spot is the one known by its id, in all that is measured."""
         poses, pixels = _poses(observations), _pixels(observations.uv, observations.cov_uv)
         return [
-            any(known.pose == pose and known.pixel == pixel for known in self._spots[name])
+            pose + pixel in self._known(name)
             for name, pose, pixel in zip(observations.id.tolist(), poses, pixels, strict=True)
         ]
+
+    def _known(self, name: str) -> list[bytes]:
+        """Both digests of each spot of that id."""
+        spots, size = self._spots[name], 2 * _DIGEST + 1
+        return [spots[k : k + size - 1] for k in range(0, len(spots), size)]
 
 
 def _poses(observations: Observations) -> list[bytes]:
@@ -96,4 +98,4 @@ def _sigmas(cov: Array) -> str:
 
 
 def _digest(text: str, content: bytes) -> bytes:
-    return hashlib.blake2b(text.encode() + b"\0" + content, digest_size=8).digest()
+    return hashlib.blake2b(text.encode() + b"\0" + content, digest_size=_DIGEST).digest()

@@ -324,6 +324,10 @@ def test_spots_and_poses_may_come_in_any_order(tmp_path: Path) -> None:
     (tmp_path / "spots.csv").write_text(text.replace("s2,9,9", "s2,9,10"))
     ids, (notice,) = watched.poll()
     assert (ids, notice.kind, notice.id) == ([], "changed", "s2")
+    # a spot that was used cannot be taken back by its verdict alone
+    (tmp_path / "spots.csv").write_text(text.replace("s2,9,9,used", "s2,9,9,reflection"))
+    ids, (notice,) = watched.poll()
+    assert (ids, notice.kind, notice.id) == ([], "changed", "s2")
 
 
 # --- pictures -----------------------------------------------------------------------------------
