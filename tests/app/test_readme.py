@@ -19,27 +19,39 @@ ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def block(language: str) -> str:
-    found = re.search(rf"```{language}\n(.*?)```", README, re.DOTALL)
-    assert found, f"the README has lost its {language} block"
-    return found.group(1)
+def block(language: str, number: int = 0) -> str:
+    found = re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
+    assert len(found) > number, f"the README has lost its {language} block {number}"
+    return found[number]
 
 
-def test_python_example_runs_and_gives_what_it_says(tmp_path: Path) -> None:
-    (tmp_path / "examples").mkdir()
-    shutil.copytree(ROOT / "examples" / "capture", tmp_path / "examples" / "capture")
-    code = block("python")
+def run_example(number: int, folder: Path) -> str:
+    (folder / "examples").mkdir()
+    shutil.copytree(ROOT / "examples" / "capture", folder / "examples" / "capture")
+    code = block("python", number)
     assert len([line for line in code.splitlines() if line.strip()]) <= 12
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
+        cwd=folder, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "RMS" in done.stdout
-    assert "converged" in done.stdout
+    return done.stdout
+
+
+def test_python_example_runs_and_gives_what_it_says(tmp_path: Path) -> None:
+    printed = run_example(0, tmp_path)
+    assert "RMS" in printed
+    assert "converged" in printed
     calibration = lc.load_calibration(tmp_path / "calibration.json")
     assert calibration.fit.converged
     assert calibration.fit.rms_px < 0.5
+
+
+def test_incremental_example_takes_every_spot(tmp_path: Path) -> None:
+    lines = run_example(1, tmp_path).splitlines()
+    calibration = lc.load_calibration(tmp_path / "calibration.json")
+    assert lines and lines[-1].startswith(f"{calibration.fit.n_spots} spots, ")
+    assert calibration.fit.converged and calibration.fit.rms_px < 0.5
 
 
 def test_capture_file_is_accepted(tmp_path: Path) -> None:
@@ -61,7 +73,7 @@ def test_capture_file_is_accepted(tmp_path: Path) -> None:
     assert capture.images_on[0] is not None
 
 
-@pytest.mark.parametrize("words", ["lasercal demo", "pytest", "lasercal detect"])
+@pytest.mark.parametrize("words", ["lasercal demo", "pytest", "lasercal detect", "lasercal watch"])
 def test_commands_are_named(words: str) -> None:
     assert words in README
 
