@@ -142,6 +142,14 @@ def watch(
     Each spot updates the result at once; when something moved, an alarm says what. Every spot is in
     the journal before it is used: after a crash, the same command goes on where it was. End it with
     Ctrl-C.
+
+    A line for --stdin, the pose in metres or as the columns of poses.csv:
+
+    \b
+      {"id": "s17", "plane": "table", "uv": [312.4, 208.9],
+       "T_base_hand": [[...], [...], [...], [0, 0, 0, 1]]}
+
+    or {"reset": {"camera": "NAME"}}, {"dismiss": true}, {"image_size": [640, 480]}.
     """
     if capture is None and not from_stdin:
         raise click.UsageError("CAPTURE is needed, except with --stdin")

@@ -5,9 +5,11 @@ from __future__ import annotations
 import builtins
 import csv
 import math
+import subprocess
+import sys
 
 import pytest
-from cli_support import Cli
+from cli_support import Cli, environment
 
 from lasercal_gtsam.calibration import Parameter
 from lasercal_gtsam.errors import DataError
@@ -172,7 +174,10 @@ def test_json_has_columns_of_all_rows(lasercal, result):
 
 def test_wrong_names_and_places_are_one_line(lasercal, result, tmp_path):
     for args, words in (
-        (("history", result, "a_A_y"), "no parameter 'a_A_y' (did you mean 'a_a_x'?); there are fu"),
+        (
+            ("history", result, "a_A_y"),
+            "no parameter 'a_A_y' (did you mean 'a_a_x'?); there are fu",
+        ),
         (("history", tmp_path / "none.json"), "there is no such file"),
         (("history", result, "--plot", tmp_path / "no" / "x.png"), "there is no folder"),
     ):
@@ -184,6 +189,21 @@ def test_wrong_names_and_places_are_one_line(lasercal, result, tmp_path):
     outcome = lasercal("history", result)
     assert "there is no history beside" in outcome.err
     assert lasercal("history", result, "--plot", "x.gif").status == 1
+
+
+def test_help_of_the_running_commands_is_light():
+    code = (
+        "import sys\n"
+        "from lasercal_gtsam.cli.main import main\n"
+        "for name in ('watch', 'update', 'history'):\n"
+        "    assert main([name, '-h']) == 0\n"
+        "heavy = {'gtsam', 'numba', 'cv2', 'scipy', 'numpy', 'pydantic', 'rich', 'matplotlib'}\n"
+        "assert not heavy & set(sys.modules), heavy & set(sys.modules)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment(), check=True
+    )
+    assert max(map(len, done.stdout.splitlines())) <= 80
 
 
 def test_plot_kinds(lasercal, result):
