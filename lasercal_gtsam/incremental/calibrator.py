@@ -58,6 +58,9 @@ _ATTEMPT_GROWTH, _AUDIT_GROWTH, _AUDITED = 1.15, 1.33, 300
 # spots behind an alarm that must be there before anything is done by itself, up to which it is
 # looked into at each spot, then at every fifth, and up to which at all
 _FEWEST, _AT_EACH, _DIAGNOSED = 6, 20, 40
+_ADVICE = (
+    "state that noise (hand_sigma_m, hand_sigma_rad) and calibrate anew, or find out what is loose"
+)
 # history: a row for each spot up to the first number, then at this growth
 _EVERY_SPOT, _HISTORY_GROWTH = 200, 1.01
 # a window is folded into the prior in pieces of this share of it
@@ -348,9 +351,9 @@ class IncrementalCalibrator:
         cause = found.causes[0]
         if cause.kind == "outliers":
             self._end_alarm("withdrawn", f"nothing has moved since spot {alarm.since}: outliers")
-        elif self._settings.automatic and cause.kind == "robot":
-            self._end_alarm("resolved", f"{cause.words}; the sigmas adapt")
-        elif self._settings.automatic and cause.kind in KINDS:
+        elif cause.kind == "robot":
+            self._alarm = replace(self._alarm, words=f"{words}; {_ADVICE}")
+        elif self._settings.automatic:
             self._free([(cause.kind, cause.name)], cause.words)
 
     def _diagnosis(self) -> Diagnosis | str:
