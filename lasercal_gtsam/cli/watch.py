@@ -143,14 +143,14 @@ def watch(
     the journal before it is used: after a crash, the same command goes on where it was. End it with
     Ctrl-C.
 
-    A line for --stdin, the pose in metres or as the columns of poses.csv:
+    A spot for --stdin (in one line), the pose in metres or as the columns of poses.csv:
 
     \b
       {"id": "s17", "plane": "table", "uv": [312.4, 208.9],
        "T_base_hand": [[...], [...], [...], [0, 0, 0, 1]]}
 
     or {"reset": {"camera": "NAME"}}, {"dismiss": true}, {"image_size": [640, 480]}.
-    """
+    """  # noqa: D301
     if capture is None and not from_stdin:
         raise click.UsageError("CAPTURE is needed, except with --stdin")
     if prefix and from_stdin:
