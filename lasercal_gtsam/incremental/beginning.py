@@ -21,8 +21,10 @@ from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.report_map import tangent_labels
 
-# degrees of freedom and spots before a first solution counts
-_FIRST_DOF, _FIRST_SPOTS = 20, 15
+# degrees of freedom (the second where spots were rejected) and spots before a first solution counts
+_FIRST_DOF, _FIRST_DOF_WITH_OUTLIERS, _FIRST_SPOTS = 20, 40, 15
+# residual RMS, as a share of the image diagonal, above which it does not
+_CREDIBLE = 0.005
 # squared sigmas by which another solution must be better to take over
 _TOLD_APART = 9.0
 
@@ -46,9 +48,19 @@ def first_solution(
         found = calibrate(observations, options=options)
     except LasercalError as error:
         return Missing("cell", "", seen, seen + 1, str(error))
-    if not found.fit.converged:
-        return Missing("cell", "", seen, seen + 1, found.fit.status)
-    lacking = int(np.ceil((_FIRST_DOF - found.fit.dof) / 2))
+    fit = found.fit
+    if not fit.converged:
+        return Missing("cell", "", seen, seen + 1, fit.status)
+    diagonal = max(float(np.hypot(*size)) for size in observations.image_size.values())
+    if fit.rms_px > _CREDIBLE * diagonal:
+        words = (
+            f"the {seen} spots do not fit each other: the best solution leaves {fit.rms_px:.2g} px "
+            "RMS. More spots may tell the bad ones apart; check pose convention and plane names"
+        )
+        return Missing("cell", "", seen, seen + 1, words)
+    # some good fits of few spots come from calling the others outliers
+    wanted = _FIRST_DOF_WITH_OUTLIERS if fit.n_rejected else _FIRST_DOF
+    lacking = int(np.ceil((wanted - fit.dof) / 2))
     if lacking > 0:
         words = f"the {seen} spots fit, but {lacking} more are needed to judge how well"
         return Missing("cell", "", seen, seen + lacking, words)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.hand_noise import HandNoise
 from lasercal_gtsam.incremental.belief import Part, coordinates
@@ -135,7 +136,10 @@ class Move:
         mine = getattr(observations, kind) == name
         if mode.good[mine].mean() < _EXPLAINED:
             for other_cell in relocated(cell, observations[mine], S[mine], kind, name):
-                z = coordinates(cell, other_cell)
+                try:
+                    z = coordinates(cell, other_cell)
+                except LasercalError:  # turned by 90 deg or more: no place to move to
+                    continue
                 b = np.linalg.solve(basis * unit, z[columns]) / SCALES[-1]
                 y = np.concatenate([np.zeros(scene.known.shape[1]), b])
                 other = scene.mode(S, SCALES[-1] * D, y)
