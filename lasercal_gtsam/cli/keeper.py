@@ -86,9 +86,11 @@ class Keeper:
         session = self.session
         if session.repaired:
             self.screen.warn(f"Warning: {session.repaired}")
+        so_far = f"{count(session.calibrator.n_spots, 'spot')} so far"
         if session.replayed:
-            so_far = count(session.calibrator.n_spots, "spot")
-            self.screen.line(f"Gone on from {session.path}: {so_far} so far.")
+            self.screen.line(f"Going on from {session.path}: {so_far}.")
+        elif session.start is not None:
+            self.screen.line(f"Going on from a calibration: {so_far}.")
         self._say_alarm(session.calibrator.alarm)
 
     def take(self, spots: Sequence[Observations]) -> None:

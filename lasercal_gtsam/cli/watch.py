@@ -60,7 +60,8 @@ class _Head(NamedTuple):
     "start",
     metavar="START.json",
     type=click.Path(path_type=Path),
-    help="Go on from this calibration; left out, the first spots give one.",
+    help="Go on from this calibration.  [default: the result, if it is there; else the first spots "
+    "give one]",
 )
 @click.option(
     "-o",
@@ -224,10 +225,7 @@ def _open(
         if start is not None and start.resolve() == target.resolve():
             start = None  # it has become the result; the journal keeps a copy
     elif start is None and target.exists() and target.stat().st_size:
-        raise DataError(
-            f"{target}: there is a calibration already, and no journal {journal.name} of it; go on "
-            f"from it with --calibration {target}, or give another name with -o"
-        )
+        start = target  # what is there is not thrown away
     options = None if said is None else said.options()
     with progress("Going through the journal") as show:
         session = JournaledCalibrator(
