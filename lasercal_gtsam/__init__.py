@@ -26,9 +26,11 @@ _EXPORTS = {
     "Observations": "observations",
     "Parameter": "calibration",
     "Plane": "cell",
+    "SigmaCheck": "sigma_check.result",
     "SolveError": "errors",
     "Update": "incremental",
     "calibrate": "api",
+    "check_sigma": "sigma_check.study",
     "load_calibration": "io.calibration_file",
     "load_capture": "io.capture",
     "project": "projection",
@@ -52,10 +54,12 @@ __all__ = [
     "Observations",
     "Parameter",
     "Plane",
+    "SigmaCheck",
     "SolveError",
     "Update",
     "__version__",
     "calibrate",
+    "check_sigma",
     "load_calibration",
     "load_capture",
     "project",
@@ -86,6 +90,8 @@ if TYPE_CHECKING:
         spot_on_ray,
         spot_triangulated,
     )
+    from lasercal_gtsam.sigma_check.result import SigmaCheck
+    from lasercal_gtsam.sigma_check.study import check_sigma
 
 
 def __getattr__(name: str) -> Any:

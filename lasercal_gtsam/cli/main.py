@@ -17,6 +17,7 @@ import click
 from lasercal_gtsam import __version__
 from lasercal_gtsam.cli.calibrate import calibrate
 from lasercal_gtsam.cli.check import check
+from lasercal_gtsam.cli.check_sigma import check_sigma
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
 from lasercal_gtsam.cli.history import history
@@ -44,7 +45,7 @@ def cli() -> None:
     """
 
 
-for _command in (calibrate, check, detect, update, watch, history, simulate, demo):
+for _command in (calibrate, check, check_sigma, detect, update, watch, history, simulate, demo):
     cli.add_command(_command)
 
 

@@ -25,23 +25,28 @@ def check_writable(path: Path) -> None:
 
 def check_calibration_target(path: Path) -> None:
     """Raise `DataError` where ``path`` cannot be written or holds something that is not ours."""
+    from lasercal_gtsam.io.calibration_file import FORMAT
+
+    check_target(path, FORMAT, "a lasercal calibration")
+
+
+def check_target(path: Path, form: str, what: str) -> None:
+    """Raise `DataError` where ``path`` cannot be written or holds anything but that ``format``."""
     check_writable(path)
-    if path.exists() and not _is_calibration(path):
+    if path.exists() and not _is_of(path, form):
         raise DataError(
-            f"{path}: there is a file that is not a lasercal calibration, and it is left as it is; "
+            f"{path}: there is a file that is not {what}, and it is left as it is; "
             "give another name with -o, or remove it"
         )
 
 
-def _is_calibration(path: Path) -> bool:
-    from lasercal_gtsam.io.calibration_file import FORMAT
-
+def _is_of(path: Path, form: str) -> bool:
     try:
         content = path.read_bytes()
-        data = json.loads(content) if content else {"format": FORMAT}  # an empty file loses nothing
+        data = json.loads(content) if content else {"format": form}  # an empty file loses nothing
     except (OSError, ValueError):
         return False
-    return isinstance(data, dict) and data.get("format") == FORMAT
+    return isinstance(data, dict) and data.get("format") == form
 
 
 @contextmanager
