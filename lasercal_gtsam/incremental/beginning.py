@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,13 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.closed_form.requirements import spots_needed
 from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.holds import Holds, resolve_holds
-from lasercal_gtsam.incremental.belief import Belief, calibrated_parts, tied_aspects
+from lasercal_gtsam.incremental.belief import (
+    Belief,
+    Mask,
+    Named,
+    calibrated_parts,
+    tied_aspects,
+)
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.settings import Settings
 from lasercal_gtsam.incremental.store import LEFT_OUT, USED, SpotStore
@@ -148,7 +155,11 @@ def continued(store: SpotStore, calibration: Calibration, settings: Settings) ->
 
 def holds_of(store: SpotStore, options: CalibrationOptions, cell: Cell) -> Holds:
     """What the options hold of the parts that stored spots show, as ``cell`` orders them."""
+    labels = tangent_labels(cell)
     seen = store.observations()
+    seen = seen[determined(seen, cell)]
+    if not len(seen):
+        return Holds(np.zeros(len(labels), np.bool_), {}, {}, frozenset(), {}, ())
     holds = resolve_holds(seen, options, cell)
     ordered = Cell(
         {name: cell.cameras[name] for name in seen.cameras},
@@ -156,5 +167,15 @@ def holds_of(store: SpotStore, options: CalibrationOptions, cell: Cell) -> Holds
         {name: cell.planes[name] for name in seen.planes},
     )
     where = dict(zip(tangent_labels(ordered), holds.held.tolist(), strict=True))
-    held = [where.get(label, False) for label in tangent_labels(cell)]
+    held = [where.get(label, False) for label in labels]
     return replace(holds, held=np.array(held, dtype=np.bool_))
+
+
+def determined(observations: Observations, cell: Cell, unknown: Iterable[Named] = ()) -> Mask:
+    """(N,) spots all of whose parts are in the cell and not unknown."""
+    good = np.isin(observations.camera, list(cell.cameras))
+    good &= np.isin(observations.laser, list(cell.lasers))
+    good &= np.isin(observations.plane, list(cell.planes))
+    for kind, name in unknown:
+        good &= getattr(observations, kind) != name
+    return np.asarray(good)

@@ -37,6 +37,7 @@ from lasercal_gtsam.report_map import (
 from lasercal_gtsam.rotations import basis_of, rotation_log
 
 Part = Literal["camera", "laser", "plane"]
+Named = tuple[Part, str]
 Mask = npt.NDArray[np.bool_]
 POSE = 6  # the camera's pose comes first of its coordinates
 _MAX_ITERATIONS = 100

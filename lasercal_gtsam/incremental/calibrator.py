@@ -16,11 +16,12 @@ from lasercal_gtsam.incremental.beginning import (
     begun,
     better_solution,
     continued,
+    determined,
     first_solution,
     holds_its_spots,
     too_few,
 )
-from lasercal_gtsam.incremental.belief import part_offset
+from lasercal_gtsam.incremental.belief import Named, part_offset
 from lasercal_gtsam.incremental.diagnosis import Diagnosis, diagnose
 from lasercal_gtsam.incremental.filter import Estimate, Filter
 from lasercal_gtsam.incremental.innovation import Innovation, innovations_of
@@ -28,8 +29,6 @@ from lasercal_gtsam.incremental.parts import (
     KINDS,
     MOVABLE,
     Found,
-    Named,
-    determined,
     find_part,
     parts_of,
     relaid,
@@ -395,12 +394,16 @@ class IncrementalCalibrator:
             at = part_offset(filter.template, kind, name)
             filter.forget_part(slice(at, at + MOVABLE[kind]))
             self._open.add((kind, name))
-        self._pending = sorted({*self._pending, *range(onset, self._store.end)})
+        given_up = sum(number < onset for number in self._pending)
+        self._pending = list(range(onset, self._store.end))
         self._alarm = None
         self._watchman.forgive(onset)
         self._use_ready()
         named = " and ".join(f"{kind} {name!r}" for kind, name in parts)
-        self._note("reset", f"{why}; freed" if why else f"{named} freed")
+        words = f"{why}; freed" if why else f"{named} freed"
+        if given_up:
+            words += f"; {given_up} spots that waited since before are given up"
+        self._note("reset", words)
 
     def _extend(self) -> None:
         """Find parts that are new or freed, as far as the spots that wait determine them."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.incremental.beginning import holds_of
-from lasercal_gtsam.incremental.belief import Mask, Part, part_offset
+from lasercal_gtsam.incremental.belief import Named, Part, part_offset
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.relocate import (
     locate_camera,
@@ -26,7 +26,6 @@ from lasercal_gtsam.report_map import CAMERA_TANGENT, tangent_labels
 KINDS: tuple[Part, ...] = ("camera", "laser", "plane")
 # coordinates that a move changes: of a camera its pose
 MOVABLE: dict[Part, int] = {"camera": 6, "laser": 4, "plane": 3}
-Named = tuple[Part, str]
 
 
 def parts_of(cell: Cell, kind: Part) -> dict[str, Camera] | dict[str, Beam] | dict[str, Plane]:
@@ -51,16 +50,6 @@ def without_parts(cell: Cell, parts: Iterable[Named]) -> Cell:
             for kind in KINDS
         )  # type: ignore[arg-type]
     )
-
-
-def determined(observations: Observations, cell: Cell, unknown: Iterable[Named] = ()) -> Mask:
-    """(N,) spots all of whose parts are in the cell and not unknown."""
-    good = np.ones(len(observations), np.bool_)
-    for kind in KINDS:
-        good &= np.isin(getattr(observations, kind), list(parts_of(cell, kind)))
-    for kind, name in unknown:
-        good &= getattr(observations, kind) != name
-    return good
 
 
 class Found(NamedTuple):

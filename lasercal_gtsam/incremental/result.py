@@ -95,6 +95,8 @@ def calibration_of(
         dtype=object,
     )
     for k in account.waiting:
+        if k < first:  # given up since
+            continue
         rejected[k - first] = "held back: it waits for more spots, or for the end of an alarm"
     used = np.array([reason is None for reason in rejected], dtype=np.bool_)
     svd = RangeSvd.of(estimate.R[:-1, :-1], uncertainty.labels, ~(estimate.fixed | estimate.open))
