@@ -136,9 +136,7 @@ class Estimate:
         scale = self.sigma0 if scale is None else scale
         scale = scale if np.isfinite(scale) and scale > 0 else 1.0
         information = carried(H, self.chart, self.z, state) / scale**2
-        return Belief(
-            cell_from_state(state, self.template), information, self.fixed, self._aspect
-        )
+        return Belief(cell_from_state(state, self.template), information, self.fixed, self._aspect)
 
     def covariance(self) -> Array:
         """(n, n) in the tangent coordinates of `cell`, scaled by ``sigma0``.
@@ -298,6 +296,9 @@ class Filter:
         if self.count <= FEW:
             self.relinearise(_SETTLED)
             return
+        if not self._possible:
+            self._pass = None
+            self._damped()
         if self._pass is None and (self.moved > _MOVED or self._grown()):
             self._pass = self._new_pass(self.z)
         if self._pass is not None:
@@ -315,6 +316,9 @@ class Filter:
             self._accept(self._whole_pass(self.z))
         for _ in range(_ROUNDS):
             if self.moved <= (settled or _SETTLED) and not self._grown():
+                return
+            if not self._possible:
+                self._damped()
                 return
             if not self._take_over(self._whole_pass(self.z)):
                 return
@@ -501,10 +505,12 @@ class Filter:
         if linear is not self._about_of or self.prior is not self._about_from:
             self._about = about_point(self.prior, linear.z) + linear.soft
             self._about_of, self._about_from = linear, self.prior
-        self._R, self.z = stream_kernels.estimate(
-            linear.H, self._about, linear.z, *self._constraints
-        )
-        self.now: State = self.chart.state(self.z)
+        self._R, z = stream_kernels.estimate(linear.H, self._about, linear.z, *self._constraints)
+        state: State = self.chart.state(z)
+        # a step too long for the linearisation may end where no camera can be
+        self._possible = bool(np.isfinite(z).all() and (state.cam_K[:, :2] > 0.0).all())
+        self.z = z if self._possible else linear.z
+        self.now = state if self._possible else self.chart.state(linear.z)
         if self.dof >= 1:
             self.scale = max(float(self._R[-1, -1]) / float(np.sqrt(self.dof)), _MIN_SCALE)
 
