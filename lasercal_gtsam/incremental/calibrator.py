@@ -23,7 +23,8 @@ from lasercal_gtsam.incremental.beginning import (
 )
 from lasercal_gtsam.incremental.belief import Named, part_offset
 from lasercal_gtsam.incremental.diagnosis import Diagnosis, diagnose
-from lasercal_gtsam.incremental.filter import Estimate, Filter
+from lasercal_gtsam.incremental.estimate import Estimate
+from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.innovation import Innovation, innovations_of
 from lasercal_gtsam.incremental.parts import (
     KINDS,

@@ -22,28 +22,21 @@ from lasercal_factors.stream_kernels import View, Weighing
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import cell_from_state, state_from_cell
-from lasercal_gtsam.incremental.belief import (
-    POSE,
-    Belief,
-    carried,
-    cell_tangent_map,
-    expansion,
-    marginalised,
-)
+from lasercal_gtsam.graph import state_from_cell
+from lasercal_gtsam.incremental.belief import POSE, Mask, marginalised
+from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.incremental.innovation import Innovation
 from lasercal_gtsam.incremental.soft_priors import Priors, soft_priors
 from lasercal_gtsam.incremental.store import SpotStore
 from lasercal_gtsam.robust import rejection_length
 
-Mask = npt.NDArray[np.bool_]
 Marks = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
 
 # spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
 SLICE, SLICE_HAND = 300, 150
-# up to this many spots, all are relinearised within the update
-FEW = 1000
+# up to this many spots, all are relinearised within the update; with a noisy hand
+FEW, FEW_HAND = 1000, 250
 # joint distance in sigmas from the point of linearisation at which a pass begins
 _MOVED = 0.05
 # where a pass is done within the update: distance at which the estimate has settled
@@ -79,94 +72,6 @@ class _Pass:
     linear: _Linear
     at: int
     marks: list[tuple[int, Marks]] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What the filter knows, to be read later whatever comes then.
-
-    Attributes
-    ----------
-    chart, template : coordinates, and the names of the parts
-    held : (n,) constants
-    open : (n,) coordinates that are not determined yet
-    z : (n,) the estimate
-    R : (n+1, n+1) square root of the information
-    cost, dof : sum of squares (a-priori sigmas) and degrees of freedom
-    weight, square : number of the used spots, and their squared residuals (px^2)
-    """
-
-    chart: CellChart
-    template: Cell
-    held: Mask
-    open: Mask
-    z: Array
-    R: Array
-    cost: float
-    dof: float
-    weight: float
-    square: float
-
-    @property
-    def sigma0(self) -> float:
-        """A-posteriori scale of the a-priori pixel sigmas; NaN without degrees of freedom."""
-        return float(np.sqrt(self.cost / self.dof)) if self.dof >= 1 else float("nan")
-
-    @property
-    def rms_px(self) -> float:
-        """Residual RMS of the used spots, px."""
-        return float(np.sqrt(self.square / self.weight)) if self.weight > 0 else 0.0
-
-    @property
-    def state(self) -> State:
-        """Plain arrays of the estimate."""
-        return self.chart.state(self.z)
-
-    @property
-    def cell(self) -> Cell:
-        """The estimate."""
-        return cell_from_state(self.state, self.template)
-
-    def belief(self, scale: float | None = None) -> Belief:
-        """The estimate as a `Belief`; in units of ``scale`` (``sigma0``; 1 where there is none)."""
-        n, state = len(self.z), self.state
-        H = self.R[:n, :n].T @ self.R[:n, :n]
-        out = self.held | self.open
-        H[out], H[:, out] = 0.0, 0.0
-        scale = self.sigma0 if scale is None else scale
-        scale = scale if np.isfinite(scale) and scale > 0 else 1.0
-        information = carried(H, self.chart, self.z, state) / scale**2
-        return Belief(cell_from_state(state, self.template), information, self.fixed, self._aspect)
-
-    def covariance(self) -> Array:
-        """(n, n) in the tangent coordinates of `cell`, scaled by ``sigma0``.
-
-        Zero for constants, NaN for what is not determined yet and where there is no scale; all NaN
-        where some combination is not determined.
-        """
-        fixed = self.fixed | self.open
-        free = np.flatnonzero(~fixed)
-        R = self.R[np.ix_(free, free)]
-        root = np.linalg.inv(R) if np.all(np.diag(R) > 0) else np.full_like(R, np.nan)
-        E = expansion(self.template, fixed, self._aspect)
-        J = cell_tangent_map(self.chart, self.z, self.state) @ E @ root
-        covariance = np.asarray(self.sigma0**2 * J @ J.T)
-        constant = ~np.any(E != 0, axis=1) & ~self.open
-        covariance[constant], covariance[:, constant] = 0.0, 0.0
-        covariance[self.open], covariance[:, self.open] = np.nan, np.nan
-        return covariance
-
-    @property
-    def _aspect(self) -> dict[str, float]:
-        pairs = zip(self.template.cameras, self.chart.aspects, strict=True)
-        return {name: aspect for name, aspect in pairs if aspect is not None}
-
-    @property
-    def fixed(self) -> Mask:
-        """Constants, and the focal lengths that follow others."""
-        fixed = self.held.copy()
-        fixed[15 * np.flatnonzero(~np.isnan(self.chart.aspect_array)) + 6] = True
-        return fixed
 
 
 class Filter:
@@ -218,7 +123,8 @@ class Filter:
         self._soft = soft_priors(self.chart, cell, held, self.priors)
         tied = np.flatnonzero(~np.isnan(self.chart.aspect_array))
         self._ties = (15 * tied + 6, 15 * tied + 7, self.chart.aspect_array[tied])
-        self._slice = SLICE_HAND if np.any(self.weighing.hand > 0) else SLICE
+        noisy = bool(np.any(self.weighing.hand > 0))
+        self._slice, self._few = (SLICE_HAND, FEW_HAND) if noisy else (SLICE, FEW)
         self._paths, self._offsets = np.empty((0, 3), np.int64), np.empty((0, 4), np.int64)
         self._pass: _Pass | None = None
         self._judged = 0
@@ -293,7 +199,7 @@ class Filter:
         """Relinearise: at once where there are few spots, else a bounded share of it."""
         if self.count < self._rest_until:
             return
-        if self.count <= FEW:
+        if self.count <= self._few:
             self.relinearise(_SETTLED)
             return
         if not self._possible:

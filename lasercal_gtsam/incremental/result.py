@@ -20,7 +20,7 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, pixel_covariances, state_from_cell
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
-from lasercal_gtsam.incremental.filter import Estimate
+from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
