@@ -28,7 +28,7 @@ START = 40  # spots given at once, before the others come one by one
 EVERY, LATER = 1000, 300  # every update is compared below the first number; then so many more
 STEADY = 1000  # spots from which on times are judged
 MS_MEDIAN, MS_99, GROWTH = 0.3, 0.6, 1.2
-_BLOCK = 500  # observations cut beforehand, so that only `add` is timed
+_AHEAD = 500  # observations cut beforehand, so that only `add` is timed
 _RANGES = (200, 1_000, 5_000, 20_000)
 
 
@@ -63,8 +63,8 @@ def run(args: argparse.Namespace, outliers: float) -> list[Finding]:
 
 def singles(observations: lc.Observations, start: int) -> Iterator[lc.Observations]:
     """The spots from ``start`` on, one at a time."""
-    for begin in range(start, len(observations), _BLOCK):
-        block = observations[begin : begin + _BLOCK]
+    for begin in range(start, len(observations), _AHEAD):
+        block = observations[begin : begin + _AHEAD]
         yield from [block[k : k + 1] for k in range(len(block))]
 
 

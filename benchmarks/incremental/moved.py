@@ -8,6 +8,7 @@ only the spots on it can show anything: its numbers count those ("affected").
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -36,6 +37,8 @@ BEFORE, NAMED, MORE, ALONE = 300, 10, 10, 20
 _PATIENCE = 60
 _THREE_SIGMA = 0.9973
 _TRIES = 50
+# the part that an event is about
+_PART = re.compile(r"(camera|laser|plane) '(\w+)'")
 
 
 @dataclass(frozen=True)
@@ -163,9 +166,9 @@ def alone(bump: Bump, base: lc.Calibration, options: lc.CalibrationOptions) -> A
         update = calibrator.add(spot)
         if affected == ALONE:
             break
-    freed = [event.words.split(" freed")[0] for event in calibrator.events if event.kind == "reset"]
-    first = freed[0].replace("'", "") if freed else "nothing"
-    return Alone(first, _errors(update, bump)[2])
+    freed = [event.words for event in calibrator.events if event.kind == "reset"]
+    named = _PART.search(freed[0]) if freed else None
+    return Alone(" ".join(named.groups()) if named else "nothing", _errors(update, bump)[2])
 
 
 def _calibrated(bump: Bump, options: lc.CalibrationOptions) -> lc.IncrementalCalibrator:
