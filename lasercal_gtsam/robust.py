@@ -81,12 +81,17 @@ _MEDIAN_RAYLEIGH = float(np.sqrt(2.0 * np.log(2.0)))
 _MIN_SCALE = 1e-6
 _ROUNDS = 10
 _MAX_SHARE = 0.5
+# share of outliers up to which one good consensus ends the search; where more are left out, few
+# spots may fit a wrong cell by its many unknowns
+_UNSETTLED_SHARE = 1 / 3
 # starts that the Cauchy loss is minimised from
 _STARTS = 3
 # random parts of the spots: share of each plane's spots and the least number of them
 _PART_SHARE, _PART_SPOTS = 1 / 3, 10
 # how many parts at least and at most, and the probability that one without outliers is among them
 _MIN_PARTS, _MAX_PARTS, _CONFIDENCE = 15, 60, 0.99
+# how many at least while no fit is credible: its residuals say nothing about the share of outliers
+_MIN_PARTS_LOST = 30
 # parts that lead to the same end, so that fewer are enough
 _AGREED = 2
 # residual scale, as a share of the image diagonal, above which a fit explains nothing
@@ -141,7 +146,8 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
     if isinstance(plain, Finished):
         found.append(consensus(search, ways.starts[0], plain.solution.cell))
     best = _best(found)
-    if ways.parts is not None and not (isinstance(plain, Finished) and clean):
+    sure = (isinstance(plain, Finished) and clean) or _settles_it(search, best)
+    if ways.parts is not None and not sure:
         best = _sampled(search, ways.parts, best)
     if best is not None:
         answer = refit(search, best, ways.refine, finish)
@@ -272,18 +278,34 @@ def _credible(search: Search, scale: float) -> bool:
     return bool(scale * typical_sigma(search) < _CREDIBLE_SCALE * diagonal)
 
 
-def _looks_clean(search: Search, lengths: Array) -> bool:
+def _looks_clean(search: Search, lengths: Array, standard_errors: float = 4.0) -> bool:
     """No residual too long, no heavy tail, and a scale that detected spots can have.
 
     A tail shows where many outliers agree: none stands out, but the root mean square exceeds the
-    scale that the median gives by more than chance (four standard errors).
+    scale that the median gives by more than chance (that many standard errors).
     """
     count, unknowns = len(lengths), _unknowns(search)
     scale = robust_scale(lengths, unknowns)
     if not lengths.max() <= rejection_length(count) * scale:
         return False
     tail = float(np.sqrt(lengths @ lengths / max(2 * count - unknowns, 1))) / scale
-    return tail < 1.0 + 4.0 * _MEDIAN_ERROR / np.sqrt(count) and _credible(search, scale)
+    bound = 1.0 + standard_errors * _MEDIAN_ERROR / np.sqrt(count)
+    return tail < bound and _credible(search, scale)
+
+
+def _settles_it(search: Search, found: Consensus | None) -> bool:
+    """Whether most spots fit, with residuals as noise alone makes them: nothing better to find.
+
+    In a wrong minimum the residuals of those that fit are not so: many small, some large.
+    """
+    if found is None:
+        return False
+    far = np.asarray(~(found.lengths <= rejection_length(len(found.lengths)) * found.scale))
+    if far.mean() > _UNSETTLED_SHARE:
+        return False
+    out = _outliers(found.lengths, _unknowns(search), far)
+    few = bool(out.mean() <= _UNSETTLED_SHARE)
+    return few and _looks_clean(search, found.lengths[~out], 2.0)
 
 
 def _sampled(
@@ -300,7 +322,7 @@ def _sampled(
                 break
             continue
         cell, size = part
-        start = search.holds.apply(cell)
+        start, found = search.holds.apply(cell), None
         middle = float(np.median(lengths_of(search, start)))
         if np.isfinite(middle) and middle <= 2.0 * lowest:
             lowest = min(lowest, middle)
@@ -312,8 +334,11 @@ def _sampled(
             continue
         if agreed >= _AGREED and _credible(search, best.scale):
             break
+        if found is best and _settles_it(search, best):
+            break
         clean = float(np.clip(best.share**size, 1e-12, 1.0 - 1e-12))
-        if trial >= max(_MIN_PARTS, np.log(1.0 - _CONFIDENCE) / np.log1p(-clean)):
+        least = _MIN_PARTS if _credible(search, best.scale) else _MIN_PARTS_LOST
+        if trial >= max(least, np.log(1.0 - _CONFIDENCE) / np.log1p(-clean)):
             break
     return best
 
