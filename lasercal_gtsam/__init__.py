@@ -29,7 +29,9 @@ _EXPORTS = {
     "SigmaCheck": "sigma_check.result",
     "SolveError": "errors",
     "Update": "incremental",
+    "Verdict": "opinions",
     "calibrate": "api",
+    "judge": "opinions",
     "check_sigma": "sigma_check.study",
     "load_calibration": "io.calibration_file",
     "load_capture": "io.capture",
@@ -57,8 +59,10 @@ __all__ = [
     "SigmaCheck",
     "SolveError",
     "Update",
+    "Verdict",
     "__version__",
     "calibrate",
+    "judge",
     "check_sigma",
     "load_calibration",
     "load_capture",
@@ -83,6 +87,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.io.calibration_file import load_calibration
     from lasercal_gtsam.io.capture import load_capture
     from lasercal_gtsam.observations import Observations
+    from lasercal_gtsam.opinions import Verdict, judge
     from lasercal_gtsam.options import CalibrationOptions
     from lasercal_gtsam.projection import (
         project,

@@ -21,6 +21,7 @@ from lasercal_gtsam.cli.check_sigma import check_sigma
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
 from lasercal_gtsam.cli.history import history
+from lasercal_gtsam.cli.judge import judge
 from lasercal_gtsam.cli.simulate import simulate
 from lasercal_gtsam.cli.update import update
 from lasercal_gtsam.cli.watch import watch
@@ -45,7 +46,18 @@ def cli() -> None:
     """
 
 
-for _command in (calibrate, check, check_sigma, detect, update, watch, history, simulate, demo):
+for _command in (
+    calibrate,
+    check,
+    check_sigma,
+    judge,
+    detect,
+    update,
+    watch,
+    history,
+    simulate,
+    demo,
+):
     cli.add_command(_command)
 
 
