@@ -10,6 +10,7 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.check.poses import SMALL_TURN_DEG, Turns
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.projection import spot_on_ray
 from lasercal_gtsam.units import DEG_PER_RAD
 
 PARALLEL_DEG = 10.0
@@ -21,6 +22,8 @@ ALIGNED_DEG = 10.0
 SMALL_SPAN = 0.5
 """Share of the picture's width and height that the spots should span."""
 FEW_SPOTS = 30
+GRAZING_DEG = 15.0
+"""Angle to its plane below which a beam or a view makes a spot long and its place uncertain."""
 
 
 class Cause(NamedTuple):
@@ -112,3 +115,40 @@ def _span(observations: Observations) -> Cause:
         "its height"
     )
     return Cause(text, bool(min(width, height) < SMALL_SPAN))
+
+
+def grazing_shots(cell: Cell, observations: Observations) -> list[str]:
+    """Planes that beams or views meet nearly along themselves: one sentence each."""
+    found = []
+    points = spot_on_ray(
+        cell,
+        observations.uv,
+        plane=observations.plane.tolist(),
+        camera=observations.camera.tolist(),
+    )
+    for name in observations.planes:
+        rows = np.flatnonzero(observations.plane == name)
+        n = cell.planes[name].normal_base
+        beams = [
+            observations.T_base_hand[k, :3, :3]
+            @ cell.lasers[str(observations.laser[k])].direction_hand
+            for k in rows
+        ]
+        views = [
+            points[k] - cell.cameras[str(observations.camera[k])].T_base_camera[:3, 3] for k in rows
+        ]
+        for what, directions in (("beam", beams), ("view", views)):
+            angles = _angles_to_plane_deg(np.array(directions), n)
+            low = int((angles < GRAZING_DEG).sum())
+            if low:
+                found.append(
+                    f"the {what} meets plane {name!r} at less than {GRAZING_DEG:.0f} deg in {low} "
+                    f"of {len(rows)} shots (least {np.nanmin(angles):.0f} deg): the spots are long "
+                    "there; turn the hand or the plane towards it"
+                )
+    return found
+
+
+def _angles_to_plane_deg(directions: Array, normal: Array) -> Array:
+    sines = np.abs(directions @ normal) / np.linalg.norm(directions, axis=1)
+    return np.asarray(np.arcsin(np.clip(sines, 0.0, 1.0)) * DEG_PER_RAD)

@@ -121,7 +121,7 @@ def sentences(diagnosis: Diagnosis) -> list[str]:
             f"No usual reading of the numbers explains the spots: the declared one, "
             f"{declared.words}, leaves {_px(declared)}, the best, {best.words}, {_px(best)}. "
             "Something else is wrong: do the pictures belong to these poses, are the plane names "
-            "right, and are the spots those of the laser?"
+            "right, and are most spots those of the laser?"
         ]
     if diagnosis.verdict == "consistent":
         lines = [f"The declared reading agrees with the spots: {fit}."]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lasercal_gtsam.check.causes import grazing_shots
 from lasercal_gtsam.check.diagnosis import Diagnosis, sentences
 from lasercal_gtsam.check.picture import Coverage, coverage, lines_of_spots
 from lasercal_gtsam.check.poses import PoseFacts, pose_facts
@@ -195,5 +196,9 @@ def _solved(found: Examination, capture: Capture, seen: Observations) -> Examina
         fit=result.fit.status,
         weak=weaknesses(result) if result.fit.converged else (),
         problems=trouble,
-        remarks=(*found.remarks, *result.observability.notes),
+        remarks=(
+            *found.remarks,
+            *(note for note in result.observability.notes if note not in result.fit.status),
+            *(grazing_shots(result.cell, seen) if result.fit.converged else ()),
+        ),
     )

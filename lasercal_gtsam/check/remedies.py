@@ -75,7 +75,7 @@ def _plane_words(cell: Cell, degrees: float) -> str:
     against = "the one there is" if len(cell.planes) == 1 else "those there are"
     return (
         f"add a plane tilted by {degrees:g} deg or more against {against}, with {SHOTS} shots in "
-        "as many hand orientations"
+        "all the hand orientations there are"
     )
 
 

@@ -14,6 +14,7 @@ from lasercal_gtsam.cli.texts import count
 if TYPE_CHECKING:
     from lasercal_gtsam.check.diagnosis import Diagnosis, Judged
     from lasercal_gtsam.check.examine import Examination
+    from lasercal_gtsam.check.picture import Coverage
     from lasercal_gtsam.check.poses import PoseFacts
     from lasercal_gtsam.check.weakness import Weakness
 
@@ -60,16 +61,7 @@ def check(capture: Path, pictures: bool, no_readings: bool, as_json: bool) -> in
 
 def _report(found: Examination) -> list[str]:
     lines = [f"{found.path}: {_counts(found.poses)}", *_pose_lines(found.poses)]
-    lines += _section(
-        "Spots:",
-        [
-            f"{'' if len(found.coverage) == 1 else f'camera {c.camera!r}: '}{count(c.spots, 'spot')}"
-            f" over {100 * c.span[0]:.0f} % of the picture's width and {100 * c.span[1]:.0f} % of "
-            f"its height, in {c.fields} of its 12 fields; the farthest is {100 * c.reach:.0f} % of "
-            "the way to a corner"
-            for c in found.coverage
-        ],
-    )
+    lines += _section("Spots:", [_coverage_line(c, len(found.coverage)) for c in found.coverage])
     if found.diagnosis is not None:
         lines += _section("Readings of the poses:", found.reading)
         lines += [f"    {line}" for line in _readings(found.diagnosis)]
@@ -98,7 +90,7 @@ def _pose_lines(poses: PoseFacts) -> list[str]:
     lines = [
         f"{count(turns.distinct, 'hand orientation')}, turned by {first:.1f}, {second:.1f} and "
         f"{third:.1f} deg rms about three axes, up to {turns.largest_deg:.0f} deg from the middle "
-        f"one: useful about {count(turns.axes, 'axis').replace('axiss', 'axes')}",
+        f"one; the turns about {turns.axes} of them are large enough to tell much",
         f"the hand moves within a box of {x:.0f} x {y:.0f} x {z:.0f} mm, up to "
         f"{poses.reach_mm:.0f} mm from the base",
     ]
@@ -116,6 +108,15 @@ def _pose_lines(poses: PoseFacts) -> list[str]:
             text += ", no groups of pure translations (none are needed, but they help the start)"
         lines.append(text)
     return _section("Hand poses:", lines)
+
+
+def _coverage_line(spots: Coverage, cameras: int) -> str:
+    who = f"camera {spots.camera!r}: " if cameras > 1 else ""
+    return (
+        f"{who}{count(spots.spots, 'spot')} over {100 * spots.span[0]:.0f} % of the picture's "
+        f"width and {100 * spots.span[1]:.0f} % of its height, in {spots.fields} of its 12 fields; "
+        f"the farthest is {100 * spots.reach:.0f} % of the way to a corner"
+    )
 
 
 def _readings(diagnosis: Diagnosis) -> list[str]:

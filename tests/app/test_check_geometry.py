@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lasercal_gtsam as lc
-from lasercal_gtsam.check.causes import causes_of
+from lasercal_gtsam.check.causes import causes_of, grazing_shots
 from lasercal_gtsam.check.picture import coverage, lines_of_spots
 from lasercal_gtsam.check.poses import Turns, pose_facts
 from lasercal_gtsam.check.remedies import NEW_PLANE, remedies
@@ -319,3 +319,17 @@ def test_turns_about_the_beam_are_told_from_turns_of_it():
         assert cause.poor == (words is not None)
         if words is not None:
             assert words in cause.words or "one axis only" in cause.words
+
+
+def test_grazing_beams_and_views_are_said():
+    simulation = simulate("tool-z", 0)
+    seen, truth = simulation.observations, simulation.truth
+    assert grazing_shots(truth, seen) == []
+    beams = seen.T_base_hand[:, :3, :3] @ truth.lasers["laser"].direction_hand
+    # a plane through the spots that holds the beam of the first shot
+    normal = np.cross(beams[0], [0.0, 1.0, 0.0])
+    steep = lc.Plane.from_point(normal, [0.45, 0.0, -0.12])
+    angles = np.rad2deg(np.arcsin(np.abs(beams @ steep.normal_base)))
+    found = grazing_shots(truth.with_planes({"1": steep}), seen)
+    expected = f"the beam meets plane '1' at less than 15 deg in {(angles < 15).sum()} of 60 shots"
+    assert any(expected in text for text in found)
