@@ -278,6 +278,13 @@ def _row(
     nothing = sum(a.freed == "nothing" for a in left_alone)
     whole = np.median([o.noticed_all for o in found])
     wrong = Counter(a.freed for a in left_alone if a.freed not in (label, "nothing"))
+    back = [
+        percent([o.part <= 1 for o in found]),
+        f"{np.median([o.worst for o in found]):.2f}",
+        percent([o.cell <= 1 for o in found]),
+    ]
+    if label == "robot":
+        back = ["-"] * 3  # there is nothing to be set free
     names = f" ({', '.join(f'{n} {x}' for x, n in wrong.items())})" if wrong else ""
     return (
         what,
@@ -288,9 +295,7 @@ def _row(
         percent([o.ever for o in found]),
         percent([o.sure for o in found]),
         ", ".join(f"{n} {x}" for x, n in others.items()) or "-",
-        percent([o.part <= 1 for o in found]),
-        f"{np.median([o.worst for o in found]):.2f}",
-        percent([o.cell <= 1 for o in found]),
+        *back,
         f"{right}, {len(left_alone) - right - nothing}{names}, {nothing}",
         percent([a.cell <= 1 for a in left_alone]),
     )
