@@ -76,8 +76,9 @@ def diagnose(
     refined = {*ranked[:_MOST_REFINED], *(k for k in solved if trials[k].pose is poses[0])}
     for k in steps.through(sorted(refined)):
         solved[k] = bench.refine(solved[k])
-    for k in steps.through(_doubtful(solved, len(poses), bench.credible_px)):
-        solved[k] = bench.retry(solved[k])
+    for k in steps.through(_next_best(solved, len(poses))):
+        if _spoiled(k, solved, bench.credible_px):
+            solved[k] = bench.retry(solved[k])
     limit_px = _limit_px(solved)
     judged = [
         solved[k].judged(limit_px) if k in solved else trial.screened(float(misfits[k]))
@@ -92,21 +93,24 @@ def _limit_px(solved: Mapping[int, Solved]) -> float:
     return rejection_length(len(best.lengths)) * best.residual_px
 
 
-def _doubtful(solved: Mapping[int, Solved], poses: int, credible_px: float) -> list[int]:
-    """Trials that outliers may have spoiled.
+def _next_best(solved: Mapping[int, Solved], poses: int) -> list[int]:
+    """The declared trial (0), and the best of the other readings of the poses."""
+    ranked = sorted((k for k in solved if 0 < k < poses), key=lambda k: solved[k].residual_px)
+    return [0, *ranked[:_MOST_RETRIED]]
 
-    None where some reading explains nearly all spots: then there are no outliers. Otherwise the
-    declared one (0) unless it is the best; and where nothing fits, the next best readings of the
-    poses as well.
+
+def _spoiled(k: int, solved: Mapping[int, Solved], credible_px: float) -> bool:
+    """Whether outliers may have spoiled a trial.
+
+    Not where some reading explains nearly all spots: then there are no outliers. Otherwise the
+    declared one (0), unless it fits as well as any; and every one where nothing fits.
     """
     best = min(solved.values(), key=lambda s: s.residual_px)
     if not best.residual_px <= credible_px:
-        ranked = sorted((k for k in solved if 0 < k < poses), key=lambda k: solved[k].residual_px)
-        return [0, *ranked[:_MOST_RETRIED]]
+        return True
     fitting = float((best.lengths <= _limit_px(solved)).mean())
-    if fitting >= _NEARLY_ALL or solved[0].residual_px <= AS_GOOD * best.residual_px:
-        return []
-    return [0]
+    as_good = solved[k].residual_px <= AS_GOOD * best.residual_px
+    return k == 0 and fitting < _NEARLY_ALL and not as_good
 
 
 def _worth_solving(misfits_px: Array, credible_px: float) -> list[int]:
