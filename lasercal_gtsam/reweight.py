@@ -50,6 +50,8 @@ _GROWTH = 1.4
 # residual, in limits, up to which a spot counts in the first round. Their start, plain least
 # squares, has to be left where outliers agree with each other; a start is at hand that is better.
 _REOPENED = 10.0
+# rounds after which mu is a million and the cut sharp, should a spot lie on it
+_MAX_DEGREES = 60
 # weights this close to 0 or 1 are decided
 _DECIDED = 1e-6
 
@@ -161,22 +163,23 @@ def _graduated(search: Search, accepted: Accepted) -> Consensus | None:
     cell, iterations = finished.solution.cell, finished.solution.iterations
     quantile = rejection_length(len(kept))
     mu = 0.0
-    while True:
+    for _ in range(_MAX_DEGREES):
         batch = spots_at(cell)
         lengths = lengths_in(batch, cell)
         scale = robust_scale(lengths[kept], unknowns)
         limit = quantile * scale
         mu = _GROWTH * mu if mu else _first_mu(lengths, limit)
         weights = truncated_weights(lengths, limit, mu)
-        kept = weights > 0.5
+        kept = lengths <= limit  # not by the weights: while these are soft, few are near one
         if np.all((weights < _DECIDED) | (weights > 1.0 - _DECIDED)):
-            return Consensus(accepted.start, cell, scale, lengths, iterations)
+            break
         step = make_graph(search.observations, batch.weighted(weights), problem.holds, cell)
         try:
             solution: Solution = solve(step, search.options.max_iterations)
         except LasercalError:
             return None
         cell, iterations = solution.cell, iterations + solution.iterations
+    return Consensus(accepted.start, cell, scale, lengths, iterations)
 
 
 def _first_mu(lengths: Array, limit: float) -> float:
