@@ -6,7 +6,7 @@ import math
 
 from lasercal_factors.kernels import jit
 
-_CLEAN, _DIRTY = (0.5, 500.0), (1.0, 9.0)  # Beta priors of the rate of outliers
+_CLEAN, _DIRTY = (0.5, 1500.0), (1.0, 9.0)  # Beta priors of the rate of outliers
 _DOUBT, _PART_DOUBT = 0.1, 0.01  # prior probabilities that all spots, or those of a part, are dirty
 _PART_SPOTS = 300.0  # weight, in spots, with which a part's own rate leans on the overall one
 _MEMORY = 10_000.0  # spots over which rates are remembered
