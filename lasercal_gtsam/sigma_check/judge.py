@@ -1,73 +1,50 @@
 """From the errors of the trials to a verdict in plain words.
 
-A row is blamed if its deviation is no chance (all tests together are wrong about a good calibration
-in one check of a hundred; Bonferroni) and large enough to matter. The interval of a standard
-deviation is that of Gaussian errors.
+What is blamed is no chance and large enough to matter. First the whole vector is judged, by its
+mean normalised squared error; then every row. Unless the whole vector has failed already, the rows
+share one false alarm in a hundred checks of a good calibration (Bonferroni).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import bdtr, bdtrc, gammainc, gammaincc, gammaincinv, ndtr, stdtr
+from scipy.special import stdtr
 
 from lasercal_gtsam.errors import SolveError
-from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.wording import some
 from lasercal_gtsam.sigma_check.result import Coverage, NeesCheck, RowCheck, SigmaCheck
+from lasercal_gtsam.sigma_check.statistics import (
+    P95,
+    Z95,
+    Trials,
+    chi2_quantile,
+    nees_check,
+    row_check,
+)
 
-# probability that a good calibration is blamed, shared by the kinds of tests and then by the rows
+# probability that any row of a good calibration is blamed, shared by the tests and the rows; and
+# that of a single test where the whole vector has failed, so that something must be wrong
 FALSE_ALARM = 0.01
 _KINDS = 5
+_SUSPECT = 0.002
 # what does not matter, even where enough trials can tell it: ratio of scatter and sigma, bias in
-# sigmas, share of the 95 % interval, normalised squared error per coordinate
+# sigmas, shares of the 68 % and the 95 % intervals, normalised squared error per coordinate
 TOLERATED_RATIO = 1.1
 TOLERATED_BIAS = 0.25
-TOLERATED_95 = (0.93, 0.97)
+TOLERATED_68, TOLERATED_95 = (0.64, 0.725), (0.93, 0.97)
 TOLERATED_NEES = 0.1
+# standard errors that the farthest of many rows may be off by chance
+_CHANCE = 3.5
 # share of solves that may fail
 _TOLERATED_FAILURES = 0.01
-_Z68, _Z95 = 1.0, 1.959963984540054
-_P68, _P95 = 0.6826894921370859, 0.95
 _FEWEST_SOLVED = 10
 # below this many degrees of freedom the noise level itself is poorly known
 _FEW_DOF = 30.0
 _MOST_NAMES, _MOST_TOGETHER = 6, 3
-
-
-@dataclass(frozen=True, eq=False)
-class Trials:
-    """Raw outcome.
-
-    ``sigma`` (rows,) is stated; ``errors`` and ``own_sigma`` are (solved, rows); ``whitened``
-    (solved, d) are errors of the whole vector with unit covariance if the stated one is right.
-    ``combinations`` (d, n): what each whitened coordinate is made of, in sigmas of the tangent
-    coordinates ``labels`` (n,).
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    sigma: Array
-    errors: Array
-    own_sigma: Array
-    whitened: Array
-    combinations: Array
-    labels: tuple[str, ...]
-    failures: dict[int, str]
-    trials: int
-    seed: int
-    from_data: bool
-    spots: int
-    dof: float
-    left_out: int
-    rejected: int
-    redrawn: int
-    noise_px: float
-    priors: tuple[str, ...]
-    outliers: int
 
 
 def judged(run: Trials) -> SigmaCheck:
@@ -85,16 +62,17 @@ def judged(run: Trials) -> SigmaCheck:
             f"check-sigma: {len(run.failures)} of {run.trials} trials have no solution, too many "
             f"to say anything about sigmas; trial {first}: {why}"
         )
-    rows = tuple(_row(run, i) for i in range(len(run.names)))
+    rows = tuple(row_check(run, i) for i in range(len(run.names)))
     nees = nees_check((run.whitened**2).sum(axis=1), run.whitened.shape[1])
-    limit = FALSE_ALARM / (_KINDS * len(rows))
+    strict = FALSE_ALARM / (_KINDS * len(rows))
+    limit = _SUSPECT if _fails(nees) else strict
     problems = [
         *_spread_problems(run, rows, limit),
         *_bias_problems(run, rows, limit),
         *_coverage_problems(run, rows, limit),
     ]
     problems += [*_nees_problems(run, nees, bool(problems)), *_failure_problems(run)]
-    resolution = math.sqrt(_chi2_quantile(1.0 - limit / 2.0, solved - 1) / (solved - 1))
+    resolution = math.sqrt(chi2_quantile(1.0 - strict / 2.0, solved - 1) / (solved - 1))
     check = SigmaCheck(
         holds=not problems,
         problems=tuple(problems),
@@ -112,111 +90,64 @@ def judged(run: Trials) -> SigmaCheck:
         redrawn=run.redrawn,
         noise_px=run.noise_px,
         resolution=resolution,
-        notes=tuple(_notes(run)),
+        notes=tuple(_notes(run, nees)),
     )
-    object.__setattr__(check, "verdict", _verdict(check))
-    return check
-
-
-# --- statistics -------------------------------------------------------------------------------
-
-
-def coverage(inside: int, trials: int, nominal: float) -> Coverage:
-    """Share of intervals that held the truth, against what they promise."""
-    share = inside / trials
-    middle = (share + 0.5 / trials) / (1.0 + 1.0 / trials)
-    half = math.sqrt(share * (1.0 - share) / trials + 0.25 / trials**2) / (1.0 + 1.0 / trials)
-    at_most = float(bdtr(inside, trials, nominal))
-    at_least = float(bdtrc(inside - 1, trials, nominal)) if inside else 1.0
-    p = min(1.0, 2.0 * min(at_most, at_least))
-    return Coverage(nominal, share, max(middle - half, 0.0), min(middle + half, 1.0), p)
-
-
-def nees_check(nees: Array, dimension: int) -> NeesCheck:
-    """Mean of the normalised squared errors with the 99 % band of chi-square."""
-    n = len(nees)
-    low, high = (_chi2_quantile(p, n * dimension) / n for p in (0.005, 0.995))
-    return NeesCheck(float(nees.mean()), dimension, low, high, float(nees.max()))
-
-
-def _chi2_quantile(p: float, dof: float) -> float:
-    return float(2.0 * gammaincinv(dof / 2.0, p))
-
-
-def _row(run: Trials, i: int) -> RowCheck:
-    e, sigma, own = run.errors[:, i], float(run.sigma[i]), run.own_sigma[:, i]
-    n = len(e)
-    scatter = float(e.std(ddof=1))
-    ratio, freedom = scatter / sigma, n - 1
-    below = float(gammainc(freedom / 2.0, freedom * ratio**2 / 2.0))
-    above = float(gammaincc(freedom / 2.0, freedom * ratio**2 / 2.0))
-    low, high = (ratio / math.sqrt(_chi2_quantile(p, freedom) / freedom) for p in (0.975, 0.025))
-    bias = float(e.mean()) / sigma
-    error_of_bias = ratio / math.sqrt(n)
-    return RowCheck(
-        name=run.names[i],
-        unit=run.units[i],
-        sigma=sigma,
-        scatter=scatter,
-        ratio=ratio,
-        ratio_low=low,
-        ratio_high=high,
-        ratio_p=min(1.0, 2.0 * min(below, above)),
-        bias=bias,
-        bias_p=float(2.0 * ndtr(-abs(bias) / error_of_bias)) if error_of_bias > 0 else 1.0,
-        coverage_68=coverage(int((np.abs(e) <= _Z68 * sigma).sum()), n, _P68),
-        coverage_95=coverage(int((np.abs(e) <= _Z95 * sigma).sum()), n, _P95),
-        own_sigma=float(np.median(own)),
-        own_coverage_95=coverage(int((np.abs(e) <= _Z95 * own).sum()), n, _P95),
-    )
+    return replace(check, verdict=_verdict(check))
 
 
 # --- words ------------------------------------------------------------------------------------
 
 
 def _spread_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
-    bad = [
-        r
-        for r in rows
-        if r.ratio_p < limit and not 1 / TOLERATED_RATIO <= r.ratio <= TOLERATED_RATIO
-    ]
+    bad = [r for r in rows if _spread_is_off(r, limit)]
     # the trials' own sigmas tell a wrong sigma in the file from a problem that bends
-    wrong = [r for r in bad if not _near(r.own_sigma / r.sigma) and _near(r.scatter / r.own_sigma)]
+    chance = _CHANCE / math.sqrt(2 * len(run.errors))
+    wrong = [r for r in bad if _explains(r.own_sigma / r.sigma, r.ratio, chance)]
+    rest = [r for r in bad if r not in wrong]
     problems = []
-    for few in (True, False):
-        rest = [r for r in bad if r not in wrong and (r.ratio > 1.0) == few]
-        if rest:
-            problems.append(_bent(run, rest) if few else _pessimistic(rest))
     if wrong:
         problems.append(
-            f"{_names(wrong, rows)}: spread {_factors(r.ratio for r in wrong)} times the sigma, "
-            f"but what the trials state of themselves is right ({_factors(_own(wrong))} times "
-            "the sigma): the stated sigmas are not those of these spots with these options; "
-            "calibrate anew"
+            f"{_names(wrong, rows)}: spread {_factors([r.ratio for r in wrong])} times the sigma, "
+            "and that is what the trials state of themselves "
+            f"({_factors([r.own_sigma / r.sigma for r in wrong])} times): the stated sigmas are "
+            "not those of these spots with these options; calibrate anew"
+        )
+    if wide := [r for r in rest if r.ratio > 1.0]:
+        problems.append(_bent(run, wide, rows))
+    if narrow := [r for r in rest if r.ratio < 1.0]:
+        problems.append(
+            f"{_names(narrow, rows)}: spread only {_factors([r.ratio for r in narrow])} times the "
+            "sigma: the sigmas are larger than the errors, on the safe side"
         )
     return problems
 
 
-def _bent(run: Trials, rows: Sequence[RowCheck]) -> str:
+def _spread_is_off(row: RowCheck, limit: float) -> bool:
+    return row.ratio_p < limit and not _near(row.ratio)
+
+
+def _bias_is_off(row: RowCheck, limit: float) -> bool:
+    return row.bias_p < limit and abs(row.bias) > TOLERATED_BIAS
+
+
+def _explains(stated: float, found: float, error: float) -> bool:
+    """Whether the factor that the trials state of themselves is the one found, to some error."""
+    return stated > 0.0 and not _near(stated) and abs(math.log(found / stated)) < error
+
+
+def _bent(run: Trials, wide: Sequence[RowCheck], rows: Sequence[RowCheck]) -> str:
     """Second-order terms grow with sigma; their share of the variance falls with the spots."""
-    excess = max(r.ratio**2 for r in rows) - 1.0
+    excess = max(r.ratio**2 for r in wide) - 1.0
     enough = run.spots * excess / (TOLERATED_RATIO**2 - 1.0)
     return (
-        f"{_names(rows)}: spread {_factors(r.ratio for r in rows)} times the sigma: with "
+        f"{_names(wide, rows)}: spread {_factors([r.ratio for r in wide])} times the sigma: with "
         f"{run.spots} spots like these the problem bends within one sigma. {_from(enough)}; until "
         "then multiply the sigmas by these factors"
     )
 
 
-def _pessimistic(rows: Sequence[RowCheck]) -> str:
-    return (
-        f"{_names(rows)}: spread only {_factors(r.ratio for r in rows)} times the sigma: the "
-        "sigmas are larger than the errors, on the safe side"
-    )
-
-
 def _bias_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
-    bad = [r for r in rows if r.bias_p < limit and abs(r.bias) > TOLERATED_BIAS]
+    bad = [r for r in rows if _bias_is_off(r, limit)]
     if not bad:
         return []
     enough = run.spots * (max(abs(r.bias) for r in bad) / TOLERATED_BIAS) ** 2
@@ -230,30 +161,24 @@ def _bias_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[
 
 def _coverage_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
     """Intervals that fail where neither spread nor bias says why."""
-    blamed = {
-        r.name
-        for r in rows
-        if (r.ratio_p < limit and not _near(r.ratio))
-        or (r.bias_p < limit and abs(r.bias) > TOLERATED_BIAS)
-    }
-    rest = [r for r in rows if r.name not in blamed]
-    low, high = TOLERATED_95
+    rest = [r for r in rows if not (_spread_is_off(r, limit) or _bias_is_off(r, limit))]
+    low, _ = TOLERATED_95
     problems = []
-    for which, words in (
-        ("coverage_95", "the 95 % interval holds the truth in {} of the trials although the "
-         "spread is right: the errors are not Gaussian"),
-        ("coverage_68", "the 68 % interval holds the truth in {} of the trials although the "
-         "spread is right: the errors are not Gaussian"),
-    ):  # fmt: skip
-        margin = (low, high) if which == "coverage_95" else (_P68 - 0.04, _P68 + 0.04)
-        bad = [r for r in rest if _off(getattr(r, which), margin, limit)]
+    for promise, found, tolerated in (
+        ("68", [r.coverage_68 for r in rest], TOLERATED_68),
+        ("95", [r.coverage_95 for r in rest], TOLERATED_95),
+    ):
+        bad = [(r, c) for r, c in zip(rest, found, strict=True) if _off(c, tolerated, limit)]
         if bad:
-            shares = [getattr(r, which).share for r in bad]
-            problems.append(f"{_names(bad)}: " + words.format(_percent(shares)))
+            problems.append(
+                f"{_names([r for r, _ in bad], rows)}: the {promise} % interval holds the truth in "
+                f"{_percent([c.share for _, c in bad])} of the trials although the spread is "
+                "right: the errors are not Gaussian"
+            )
     own = [r for r in rest if _off(r.own_coverage_95, TOLERATED_95, limit)]
     if own:
         shares = [r.own_coverage_95.share for r in own]
-        expected = float(2.0 * stdtr(run.dof, _Z95) - 1.0) if run.dof < _FEW_DOF else _P95
+        expected = float(2.0 * stdtr(run.dof, Z95) - 1.0) if run.dof < _FEW_DOF else P95
         why = (
             f"the noise itself is estimated from {run.dof:.0f} degrees of freedom only; take "
             f"{_t_quantile(run.dof):.2f} sigmas for 95 %, or add spots"
@@ -267,22 +192,46 @@ def _coverage_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> l
     return problems
 
 
+def _fails(nees: NeesCheck) -> bool:
+    """Whether the mean is farther out than its chance and what is tolerated, both together."""
+    low, high = nees.low * (1.0 - TOLERATED_NEES), nees.high * (1.0 + TOLERATED_NEES)
+    return not low <= nees.mean <= high
+
+
 def _nees_problems(run: Trials, nees: NeesCheck, rows_fail: bool) -> list[str]:
-    per_coordinate = nees.mean / nees.dimension
-    if nees.low <= nees.mean <= nees.high or abs(per_coordinate - 1.0) <= TOLERATED_NEES:
+    if not _fails(nees):
         return []
-    moments = run.whitened.T @ run.whitened / len(run.whitened)
-    values, vectors = np.linalg.eigh(moments)
-    at = -1 if per_coordinate > 1.0 else 0
-    together = np.abs(vectors[:, at] @ run.combinations)
+    found = nees.mean / nees.dimension
+    begin = "all rows together" if rows_fail else "no row alone, but all together"
+    begin += (
+        f": the normalised squared error is {nees.mean:.1f} on the average, expected "
+        f"{nees.dimension} (99 % band {nees.low:.1f} to {nees.high:.1f})"
+    )
+    if _explains(math.sqrt(run.volume), math.sqrt(found), 0.25 * abs(math.log(found))):
+        return [
+            f"{begin}, as if the sigmas were {math.sqrt(found):.2f} times as large; the trials "
+            "state that themselves: the stated covariance is not that of these spots with these "
+            "options; calibrate anew"
+        ]
+    if found < 1.0:
+        return [f"{begin}: the joint covariance is larger than the errors, on the safe side"]
+    enough = run.spots * (found - 1.0) / TOLERATED_NEES
+    return [f"{begin}{_farthest(run)}. {_from(enough, 'joint covariance holds')}"]
+
+
+def _farthest(run: Trials) -> str:
+    """The combination that is spread most, if that is more than the largest of many by chance."""
+    solved, dimension = run.whitened.shape
+    values, vectors = np.linalg.eigh(run.whitened.T @ run.whitened / solved)
+    spread = math.sqrt(values[-1])
+    if spread < TOLERATED_RATIO * (1.0 + math.sqrt(dimension / solved)):
+        return ""
+    together = np.abs(vectors[:, -1] @ run.combinations)
     parts = [run.labels[i] for i in np.argsort(-together, kind="stable")[:_MOST_TOGETHER]]
-    begin = "all together" if rows_fail else "each row holds by itself, but not all together"
-    return [
-        f"{begin}: the normalised squared error is {nees.mean:.1f} on the average, expected "
-        f"{nees.dimension} (99 % band {nees.low:.1f} to {nees.high:.1f}); farthest off is a "
-        f"combination of {', '.join(parts)}, spread {math.sqrt(values[at]):.2f} times what the "
-        "joint covariance says: do not trust it for differences and ratios of these"
-    ]
+    return (
+        f"; farthest off is a combination of {', '.join(parts)}, spread {spread:.2f} times what "
+        "the joint covariance says: do not trust it for differences of these"
+    )
 
 
 def _failure_problems(run: Trials) -> list[str]:
@@ -304,8 +253,13 @@ def _verdict(check: SigmaCheck) -> str:
     )
 
 
-def _notes(run: Trials) -> list[str]:
+def _notes(run: Trials, nees: NeesCheck) -> list[str]:
     notes = []
+    if not (nees.low <= nees.mean <= nees.high or _fails(nees)):
+        notes.append(
+            f"the normalised squared error is outside its band, but within {TOLERATED_NEES:.0%} "
+            "of it: the joint covariance is off by no more than matters"
+        )
     if run.priors:
         notes.append(
             f"there are priors ({some(run.priors)}): their sigmas promise to hold on the average "
@@ -337,10 +291,6 @@ def _off(found: Coverage, margin: tuple[float, float], limit: float) -> bool:
     return found.p_value < limit and not margin[0] <= found.share <= margin[1]
 
 
-def _own(rows: Sequence[RowCheck]) -> list[float]:
-    return [r.own_sigma / r.sigma for r in rows]
-
-
 def _t_quantile(dof: float) -> float:
     """97.5 % quantile of Student's t, by bisection on its distribution function."""
     low, high = 1.0, 1e3
@@ -350,15 +300,16 @@ def _t_quantile(dof: float) -> float:
     return high
 
 
-def _names(rows: Sequence[RowCheck], everyone: Sequence[RowCheck] = ()) -> str:
+def _names(rows: Sequence[RowCheck], everyone: Sequence[RowCheck]) -> str:
     if len(rows) == len(everyone):
         return f"all {len(rows)} rows"
+    if 2 * len(rows) > len(everyone) > _MOST_NAMES:
+        return f"{len(rows)} of {len(everyone)} rows ({some([r.name for r in rows], _MOST_NAMES)})"
     return some([r.name for r in rows], _MOST_NAMES)
 
 
-def _factors(values: object) -> str:
-    numbers = sorted(values)  # type: ignore[call-overload]
-    low, high = f"{numbers[0]:.2f}", f"{numbers[-1]:.2f}"
+def _factors(values: Sequence[float]) -> str:
+    low, high = f"{min(values):.2f}", f"{max(values):.2f}"
     return low if low == high else f"{low} to {high}"
 
 
@@ -367,7 +318,7 @@ def _percent(shares: Sequence[float]) -> str:
     return f"{low} %" if low == high else f"{low} to {high} %"
 
 
-def _from(spots: float) -> str:
+def _from(spots: float, what: str = "sigmas hold") -> str:
     """A number of spots with two digits, rounded up."""
     step = 10.0 ** max(math.floor(math.log10(max(spots, 1.0))) - 1, 0)
-    return f"The sigmas hold from about {math.ceil(spots / step) * step:.0f} spots on"
+    return f"The {what} from about {math.ceil(spots / step) * step:.0f} spots on"

@@ -15,9 +15,10 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import beam_frames
 from lasercal_gtsam.incremental.belief import coordinates
 from lasercal_gtsam.report_map import BeamChart, row_jacobian, row_names, row_values
-from lasercal_gtsam.sigma_check.judge import Trials, judged
+from lasercal_gtsam.sigma_check.judge import judged
 from lasercal_gtsam.sigma_check.redraw import Mask, Redraw, redraw_of
 from lasercal_gtsam.sigma_check.result import SigmaCheck
+from lasercal_gtsam.sigma_check.statistics import Trials
 from lasercal_gtsam.simulate.streams import NOISE, stream
 
 Progress = Callable[[int, int], None]
@@ -79,7 +80,7 @@ def check_sigma(
     stream(seed, NOISE)  # refuse a bad seed before any work
     redraw = redraw_of(calibration, from_data)
     target = _Target.of(calibration, redraw)
-    errors, own, whitened = [], [], []
+    errors, own, whitened, volumes = [], [], [], []
     failures: dict[int, str] = {}
     rejected = redrawn = 0
     for k in range(int(trials)):
@@ -99,6 +100,7 @@ def check_sigma(
                 errors.append(target.error(found))
                 own.append(target.own_sigmas(found))
                 whitened.append(target.whitened(found))
+                volumes.append(target.volume(found))
             else:
                 failures[k] = found.fit.status
         if progress is not None:
@@ -112,6 +114,7 @@ def check_sigma(
         whitened=np.array(whitened).reshape(len(whitened), len(target.whitening)),
         combinations=target.whitening * np.sqrt(np.diag(calibration.covariance)),
         labels=calibration.labels,
+        volume=float(np.median(volumes)) if volumes else np.nan,
         failures=failures,
         trials=int(trials),
         seed=int(seed),
@@ -187,6 +190,11 @@ class _Target:
     def whitened(self, found: Calibration) -> Array:
         """Error of all free coordinates together, with unit covariance if the stated one holds."""
         return np.asarray(self.whitening @ coordinates(self.redraw.truth, found.cell))
+
+    def volume(self, found: Calibration) -> float:
+        """Determinant of the trial's own covariance over the stated one, per coordinate."""
+        own = self.whitening @ found.covariance @ self.whitening.T
+        return float(np.exp(np.linalg.slogdet(own)[1] / len(own)))
 
 
 def _whitening(covariance: Array, free: Mask) -> Array:
