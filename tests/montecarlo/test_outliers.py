@@ -23,7 +23,7 @@ def test_the_study_runs():
 def test_a_fifth_of_outliers_without_a_start(spots, seeds, robust, kind):
     tally = outlier_study(spots, 0.2, kind, range(seeds), robust)
     print(table_row(0.2, kind, tally, 0))
-    assert tally.reached >= 0.95
+    assert tally.reached >= 0.99
     assert tally.precision >= 0.98
-    assert tally.recall >= 0.95
+    assert tally.recall >= 0.98
     assert tally.silent == 0
