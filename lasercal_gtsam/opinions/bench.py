@@ -30,6 +30,7 @@ from lasercal_gtsam.graph import (
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
 from lasercal_gtsam.holds import resolve_holds
 from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import point_jacobian, spot_on_beam
 from lasercal_gtsam.report_map import BEAM_TANGENT, CAMERA_TANGENT, PLANE_TANGENT, tangent_labels
 
@@ -176,7 +177,6 @@ def lay_out(calibration: Calibration) -> Bench:
         )
     A, r = _system(problem, rows, np.einsum("nij,nj->ni", W, residual), used)
     kept = seen[used]
-    R, tolerance = kept.T_base_hand[:, :3, :3], max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad)
     return Bench(
         observations=kept,
         cell=cell,
@@ -188,12 +188,21 @@ def lay_out(calibration: Calibration) -> Bench:
         whitening=W[used],
         A=A,
         r=r,
-        group=group_labels(R, kept.plane_index, tolerance),
-        orientation=group_labels(R, np.zeros(len(kept), np.int64), tolerance),
+        group=orientation_groups(kept, options),
+        orientation=orientation_groups(kept, options, by_plane=False),
         exact=exact,
         unit=unit,
         stated=options.sigma_px is not None or not np.isnan(seen.cov_uv).any(),
     )
+
+
+def orientation_groups(
+    observations: Observations, options: CalibrationOptions, by_plane: bool = True
+) -> Index:
+    """(N,) labels of equal hand orientation (within four times its noise), and equal plane."""
+    tolerance = max(GROUP_TOLERANCE_RAD, 4 * options.hand_sigma_rad)
+    plane = observations.plane_index if by_plane else np.zeros(len(observations), np.int64)
+    return group_labels(observations.T_base_hand[:, :3, :3], plane, tolerance)
 
 
 def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, float]:

@@ -9,10 +9,10 @@ import numpy.typing as npt
 
 from lasercal_gtsam.api import calibrate
 from lasercal_gtsam.calibration import Calibration
-from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, group_labels
 from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import beam_frames
+from lasercal_gtsam.opinions.bench import orientation_groups
 from lasercal_gtsam.opinions.chances import f_above
 from lasercal_gtsam.report_map import BeamChart, row_jacobian, row_names, row_values
 
@@ -66,8 +66,7 @@ def halves(calibration: Calibration) -> npt.NDArray[np.bool_]:
     were left out are in neither half (the second array of `split` leaves them out too).
     """
     seen = calibration.inputs.observations
-    tolerance = max(GROUP_TOLERANCE_RAD, 4 * calibration.inputs.options.hand_sigma_rad)
-    group = group_labels(seen.T_base_hand[:, :3, :3], seen.plane_index, tolerance)
+    group = orientation_groups(seen, calibration.inputs.options)
     used = calibration.spots.weight > 0
     order = np.lexsort((np.arange(len(seen)), group, seen.plane_index, seen.camera_index))
     order = order[used[order]]

@@ -18,13 +18,16 @@ import numpy as np
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.opinions.bench import BEAM, CAMERA, PLANE, Bench, Index, column_space
 from lasercal_gtsam.opinions.chances import f_above
-from lasercal_gtsam.rotations import basis_of, skew
+from lasercal_gtsam.rotations import basis_of
 from lasercal_gtsam.units import MM_PER_M
 
 Part = Literal["camera", "laser", "plane", "robot"]
 FAULT_CHANCE = 1e-4
 """Chance of naming any fault in a good calibration (all suspects together): a cell is calibrated
 many times in its life, and a wrong accusation sends somebody looking for nothing."""
+RIVAL_SCORE = 6.0
+"""Difference of the criterion up to which two faults are not told apart ("positive" evidence at
+most; Kass and Raftery, 1995)."""
 # moments at which something may have moved: so many, evenly, if there are more
 _MOST_MOMENTS = 12
 # what an amount may shrink to by the projection and still be tested
@@ -89,6 +92,18 @@ def culprit(findings: tuple[Finding, ...]) -> Finding | None:
     """The suspect to name: the first, if it is significant and worth its unknowns."""
     first = findings[0] if findings else None
     return first if first is not None and first.significant and first.score > 0 else None
+
+
+def rivals(findings: tuple[Finding, ...]) -> tuple[Finding, ...]:
+    """The best fault of each other kind that explains the residuals nearly as well as the first."""
+    named = culprit(findings)
+    if named is None:
+        return ()
+    kinds = {(named.part, named.fault): named}
+    for finding in findings[1:]:
+        if finding.significant and finding.score > named.score - RIVAL_SCORE:
+            kinds.setdefault((finding.part, finding.fault), finding)
+    return tuple(kinds.values())[1:]
 
 
 def gain_of(bench: Bench, columns: Array) -> tuple[float, int]:
@@ -169,7 +184,7 @@ def _moved(bench: Bench, part: Part, name: str, rows: Index, blocks: Array) -> I
 
 
 def _lens(bench: Bench, name: str, rows: Index) -> Iterator[Suspect]:
-    """Terms beyond the model's, held ones too: radial; then any smooth field over the picture."""
+    """Distortion terms, held ones and ``r^6`` too; then any smooth field over the picture."""
     camera = bench.cell.cameras[name]
     R, t = camera.T_base_camera[:3, :3], camera.T_base_camera[:3, 3]
     p = (bench.points[rows] - t) @ R
@@ -179,17 +194,24 @@ def _lens(bench: Bench, name: str, rows: Index) -> Iterator[Suspect]:
     # powers of a coordinate of about one
     z = xy / np.sqrt(np.mean(np.sum(xy**2, axis=1)))
     r2 = np.sum(z**2, axis=1, keepdims=True)
-    radial = np.stack([z * r2, z * r2**2, z * r2**3], axis=2)
-    blocks = np.zeros((len(bench), 2, 3))
-    blocks[rows] = to_pixel @ radial
+    x, y = z.T
+    decentred = [
+        np.column_stack([2 * x * y, r2[:, 0] + 2 * y * y]),
+        np.column_stack([r2[:, 0] + 2 * x * x, 2 * x * y]),
+    ]
+    terms = np.stack([z * r2, z * r2**2, z * r2**3, *decentred], axis=2)
+    blocks = np.zeros((len(bench), 2, terms.shape[2]))
+    blocks[rows] = to_pixel @ terms
     words = f"the lens of camera {name!r} bends rays otherwise than the model does"
-    yield Suspect("camera", name, "lens", f"{words} (radially)", bench.columns(blocks))
+    yield Suspect(
+        "camera", name, "lens", f"{words} (radially, or decentred)", bench.columns(blocks)
+    )
     powers = [z[:, 0] ** a * z[:, 1] ** b for a in range(4) for b in range(4 - a) if a + b >= 2]
     field = np.stack([np.kron(np.eye(2), f) for f in powers], axis=0)  # (K, 2, 2 N)
     field = field.reshape(len(powers), 2, 2, len(rows)).transpose(3, 1, 0, 2)
     blocks = np.zeros((len(bench), 2, 2 * len(powers)))
     blocks[rows] = to_pixel @ field.reshape(len(rows), 2, -1)
-    yield Suspect("camera", name, "lens", f"{words} (not radially)", bench.columns(blocks))
+    yield Suspect("camera", name, "lens", f"{words} (otherwise)", bench.columns(blocks))
 
 
 def _bent(bench: Bench, name: str, rows: Index) -> Suspect:
@@ -229,19 +251,21 @@ def _robot(bench: Bench) -> Iterator[Suspect]:
         "the robot's distances are not the same in all directions",
         bench.columns(stretch),
     )
-    # turned about a horizontal axis across one of the hand's own axes: what a wrist joint does
-    across = np.cross([0.0, 0.0, 1.0], np.swapaxes(R, 1, 2))  # (N, 3 hand axes, 3) in base
-    axes = np.swapaxes(R, 1, 2) @ np.swapaxes(across, 1, 2)  # (N, 3, 3): columns in hand
-    # the joint's axis passes the hand's origin at some distance along the hand's own axes
-    lever = np.concatenate([shift @ R @ -skew(e) @ axes for e in np.eye(3)], axis=2)
-    yield Suspect(
-        "robot",
-        "joint",
-        "orientation",
-        "hand poses are wrong in a way that goes with the hand's orientation, as if a joint's "
-        "zero were off",
-        bench.columns(np.concatenate([turn @ axes, lever], axis=2)),
-    )
+    # turned about a horizontal axis across one of the hand's own axes: what a wrist joint does. The
+    # joint's axis passes the hand's origin at some place in the hand
+    for axis, own in zip("xyz", np.moveaxis(R, 2, 0), strict=True):
+        turned = np.einsum("nji,nj->ni", R, np.cross([0.0, 0.0, 1.0], own))
+        lever = [np.cross(e, turned)[:, :, None] for e in np.eye(3)]
+        yield Suspect(
+            "robot",
+            f"joint across {axis}",
+            "orientation",
+            "hand poses are wrong in a way that goes with the hand's orientation, as if the zero "
+            f"of a joint across the hand's {axis} axis were off",
+            bench.columns(
+                np.concatenate([turn @ turned[:, :, None], *(shift @ R @ x for x in lever)], axis=2)
+            ),
+        )
     labels, counts = np.unique(bench.orientation, return_counts=True)
     several = labels[counts >= 4] if len(labels) <= 40 else labels[:0]
     whole = []
