@@ -24,6 +24,7 @@ from lasercal_gtsam.hand_noise import refine_with_hand_noise
 from lasercal_gtsam.holds import Holds, resolve_holds
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.random_parts import parts_of
 from lasercal_gtsam.reweight import refine_truncated, refine_with_loss
 from lasercal_gtsam.robust import (
     Accepted,
@@ -31,7 +32,6 @@ from lasercal_gtsam.robust import (
     Mask,
     Ways,
     lengths_of,
-    parts_of,
     refine_without_outliers,
 )
 from lasercal_gtsam.solve import Solution, fold_warnings

@@ -34,8 +34,8 @@ class Ways(NamedTuple):
     """Where to start, and how to go on from there.
 
     ``starts``: cells, the likeliest first. ``refine``: plain least squares from some of them.
-    ``parts``: more starts, from parts of the spots (`parts_of`). ``suspicious``: the starts were
-    made without some of the spots.
+    ``parts``: more starts, from parts of the spots (`random_parts.parts_of`). ``suspicious``: the
+    starts were made without some of the spots.
     """
 
     starts: Sequence[Cell]
@@ -86,10 +86,8 @@ _MAX_SHARE = 0.5
 _UNSETTLED_SHARE = 1 / 3
 # starts that the Cauchy loss is minimised from
 _STARTS = 3
-# random parts of the spots: share of each plane's spots and the least number of them
-_PART_SHARE, _PART_SPOTS = 1 / 3, 10
-# how many parts at least and at most, and the probability that one without outliers is among them
-_MIN_PARTS, _MAX_PARTS, _CONFIDENCE = 15, 60, 0.99
+# how many random parts at least, and the probability that one without outliers is among them
+_MIN_PARTS, _CONFIDENCE = 15, 0.99
 # how many at least while no fit is credible: its residuals say nothing about the share of outliers
 _MIN_PARTS_LOST = 30
 # parts that lead to the same end, so that fewer are enough
@@ -187,30 +185,6 @@ def lengths_in(batch: SpotBatch, cell: Cell) -> Array:
     """The same for the spots of a batch."""
     lengths = batch.whitened_lengths(state_from_cell(cell))
     return np.where(np.isnan(lengths), np.inf, lengths)
-
-
-def parts_of(
-    observations: Observations, closed_form: Callable[[Observations], Cell], seed: int
-) -> Iterator[tuple[Cell, int] | None]:
-    """Closed forms of random parts of the spots: a third of each plane's, at least ten.
-
-    Yields (cell, number of spots), or None where the closed form refused the part.
-    """
-    rng = np.random.default_rng(seed)
-    index = np.column_stack(
-        [observations.camera_index, observations.laser_index, observations.plane_index]
-    )
-    members = [np.flatnonzero((index == block).all(axis=1)) for block in np.unique(index, axis=0)]
-    for _ in range(_MAX_PARTS):
-        chosen = [
-            rng.permutation(m)[: max(_PART_SPOTS, int(np.ceil(_PART_SHARE * len(m))))]
-            for m in members
-        ]
-        rows = np.sort(np.concatenate(chosen))
-        try:
-            yield closed_form(observations[rows]), len(rows)
-        except DegenerateError:
-            yield None
 
 
 @dataclass(frozen=True)
