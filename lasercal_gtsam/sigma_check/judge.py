@@ -37,8 +37,6 @@ TOLERATED_RATIO = 1.1
 TOLERATED_BIAS = 0.25
 TOLERATED_68, TOLERATED_95 = (0.64, 0.725), (0.93, 0.97)
 TOLERATED_NEES = 0.1
-# standard errors that the farthest of many rows may be off by chance
-_CHANCE = 3.5
 # share of solves that may fail
 _TOLERATED_FAILURES = 0.01
 _FEWEST_SOLVED = 10
@@ -67,6 +65,7 @@ def judged(run: Trials) -> SigmaCheck:
     strict = FALSE_ALARM / (_KINDS * len(rows))
     limit = _SUSPECT if _fails(nees) else strict
     problems = [
+        *_file_problems(rows),
         *_spread_problems(run, rows, limit),
         *_bias_problems(run, rows, limit),
         *_coverage_problems(run, rows, limit),
@@ -98,23 +97,28 @@ def judged(run: Trials) -> SigmaCheck:
 # --- words ------------------------------------------------------------------------------------
 
 
+def _file_problems(rows: Sequence[RowCheck]) -> list[str]:
+    """Stated sigmas that the same spots and options do not give: no question of chance."""
+    wrong = [r for r in rows if _wrong(r)]
+    if not wrong:
+        return []
+    return [
+        f"{_names(wrong, rows)}: the stated sigma is not what the calibration's spots give with "
+        f"its options when they are solved at once; that is "
+        f"{_factors([r.expected_sigma / r.sigma for r in wrong])} times as large. Calibrate anew"
+    ]
+
+
+def _wrong(row: RowCheck) -> bool:
+    return not _near(row.expected_sigma / row.sigma)
+
+
 def _spread_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
-    bad = [r for r in rows if _spread_is_off(r, limit)]
-    # the trials' own sigmas tell a wrong sigma in the file from a problem that bends
-    chance = _CHANCE / math.sqrt(2 * len(run.errors))
-    wrong = [r for r in bad if _explains(r.own_sigma / r.sigma, r.ratio, chance)]
-    rest = [r for r in bad if r not in wrong]
+    bad = [r for r in rows if _spread_is_off(r, limit) and not _wrong(r)]
     problems = []
-    if wrong:
-        problems.append(
-            f"{_names(wrong, rows)}: spread {_factors([r.ratio for r in wrong])} times the sigma, "
-            "and that is what the trials state of themselves "
-            f"({_factors([r.own_sigma / r.sigma for r in wrong])} times): the stated sigmas are "
-            "not those of these spots with these options; calibrate anew"
-        )
-    if wide := [r for r in rest if r.ratio > 1.0]:
+    if wide := [r for r in bad if r.ratio > 1.0]:
         problems.append(_bent(run, wide, rows))
-    if narrow := [r for r in rest if r.ratio < 1.0]:
+    if narrow := [r for r in bad if r.ratio < 1.0]:
         problems.append(
             f"{_names(narrow, rows)}: spread only {_factors([r.ratio for r in narrow])} times the "
             "sigma: the sigmas are larger than the errors, on the safe side"
@@ -130,11 +134,6 @@ def _bias_is_off(row: RowCheck, limit: float) -> bool:
     return row.bias_p < limit and abs(row.bias) > TOLERATED_BIAS
 
 
-def _explains(stated: float, found: float, error: float) -> bool:
-    """Whether the factor that the trials state of themselves is the one found, to some error."""
-    return stated > 0.0 and not _near(stated) and abs(math.log(found / stated)) < error
-
-
 def _bent(run: Trials, wide: Sequence[RowCheck], rows: Sequence[RowCheck]) -> str:
     """Second-order terms grow with sigma; their share of the variance falls with the spots."""
     excess = max(r.ratio**2 for r in wide) - 1.0
@@ -147,7 +146,7 @@ def _bent(run: Trials, wide: Sequence[RowCheck], rows: Sequence[RowCheck]) -> st
 
 
 def _bias_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
-    bad = [r for r in rows if _bias_is_off(r, limit)]
+    bad = [r for r in rows if _bias_is_off(r, limit) and not _wrong(r)]
     if not bad:
         return []
     enough = run.spots * (max(abs(r.bias) for r in bad) / TOLERATED_BIAS) ** 2
@@ -161,7 +160,8 @@ def _bias_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[
 
 def _coverage_problems(run: Trials, rows: Sequence[RowCheck], limit: float) -> list[str]:
     """Intervals that fail where neither spread nor bias says why."""
-    rest = [r for r in rows if not (_spread_is_off(r, limit) or _bias_is_off(r, limit))]
+    blamed = [_spread_is_off(r, limit) or _bias_is_off(r, limit) or _wrong(r) for r in rows]
+    rest = [r for r, known in zip(rows, blamed, strict=True) if not known]
     low, _ = TOLERATED_95
     problems = []
     for promise, found, tolerated in (
@@ -207,11 +207,11 @@ def _nees_problems(run: Trials, nees: NeesCheck, rows_fail: bool) -> list[str]:
         f": the normalised squared error is {nees.mean:.1f} on the average, expected "
         f"{nees.dimension} (99 % band {nees.low:.1f} to {nees.high:.1f})"
     )
-    if _explains(math.sqrt(run.volume), math.sqrt(found), 0.25 * abs(math.log(found))):
+    if not _near(math.sqrt(run.volume)):
         return [
-            f"{begin}, as if the sigmas were {math.sqrt(found):.2f} times as large; the trials "
-            "state that themselves: the stated covariance is not that of these spots with these "
-            "options; calibrate anew"
+            f"{begin}: the stated covariance is not what the calibration's spots give with its "
+            f"options when they are solved at once; that is {run.volume:.2f} times as large. "
+            "Calibrate anew"
         ]
     if found < 1.0:
         return [f"{begin}: the joint covariance is larger than the errors, on the safe side"]
@@ -244,7 +244,7 @@ def _failure_problems(run: Trials) -> list[str]:
 
 def _verdict(check: SigmaCheck) -> str:
     if check.problems:
-        return "The sigmas do not all hold: " + "; ".join(check.problems) + "."
+        return "The sigmas do not all hold. " + ". ".join(check.problems) + "."
     widest = max(check.rows, key=lambda r: abs(math.log(max(r.ratio, 1e-9))))
     return (
         f"The sigmas hold: no row's spread differs from its sigma by more than chance allows (the "

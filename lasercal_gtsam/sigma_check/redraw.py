@@ -239,6 +239,8 @@ def _options_of(
 ) -> tuple[CalibrationOptions, Holds]:
     """Options that hold what the calibration held, each at its value there."""
     options = calibration.inputs.options
+    if options.distortion == "auto":  # which terms were chosen is given, as the sigmas take it
+        options = replace(options, distortion="all")
     kept = options.fixed
     if from_data:
         kept = tuple(f for f in options.fixed if any(part in f for part in _NEEDS_START))

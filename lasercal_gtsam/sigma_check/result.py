@@ -32,6 +32,7 @@ class RowCheck:
     ----------
     name, unit : as in the table
     sigma : stated by the calibration
+    expected_sigma : what the calibration's spots give with its options when they are solved at once
     scatter : standard deviation of the estimates over the trials
     ratio : ``scatter / sigma``
     ratio_low, ratio_high : 95 % interval of the ratio (chi-square)
@@ -46,6 +47,7 @@ class RowCheck:
     name: str
     unit: str
     sigma: float
+    expected_sigma: float
     scatter: float
     ratio: float
     ratio_low: float

@@ -22,14 +22,15 @@ class Trials:
     ``sigma`` (rows,) is stated; ``errors`` and ``own_sigma`` are (solved, rows); ``whitened``
     (solved, d) are errors of the whole vector with unit covariance if the stated one is right.
     ``combinations`` (d, n): what each whitened coordinate is made of, in sigmas of the tangent
-    coordinates ``labels`` (n,). ``volume``: variance per coordinate that the trials state of
-    themselves, in units of the stated one (geometric mean over the coordinates, median over the
-    trials).
+    coordinates ``labels`` (n,). ``expected_sigma`` (rows,): what the calibration's own spots give
+    when they are solved at once from its estimate; ``volume``: their joint covariance in units of
+    the stated one (variance per coordinate, geometric mean).
     """
 
     names: tuple[str, ...]
     units: tuple[str, ...]
     sigma: Array
+    expected_sigma: Array
     errors: Array
     own_sigma: Array
     whitened: Array
@@ -88,6 +89,7 @@ def row_check(run: Trials, i: int) -> RowCheck:
         name=run.names[i],
         unit=run.units[i],
         sigma=sigma,
+        expected_sigma=float(run.expected_sigma[i]),
         scatter=scatter,
         ratio=ratio,
         ratio_low=low,

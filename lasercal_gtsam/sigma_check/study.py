@@ -80,7 +80,8 @@ def check_sigma(
     stream(seed, NOISE)  # refuse a bad seed before any work
     redraw = redraw_of(calibration, from_data)
     target = _Target.of(calibration, redraw)
-    errors, own, whitened, volumes = [], [], [], []
+    again = _solved_again(redraw)
+    errors, own, whitened = [], [], []
     failures: dict[int, str] = {}
     rejected = redrawn = 0
     for k in range(int(trials)):
@@ -100,7 +101,6 @@ def check_sigma(
                 errors.append(target.error(found))
                 own.append(target.own_sigmas(found))
                 whitened.append(target.whitened(found))
-                volumes.append(target.volume(found))
             else:
                 failures[k] = found.fit.status
         if progress is not None:
@@ -109,12 +109,13 @@ def check_sigma(
         names=target.names,
         units=target.units,
         sigma=target.sigma,
+        expected_sigma=target.own_sigmas(again),
         errors=np.array(errors).reshape(len(errors), len(target.names)),
         own_sigma=np.array(own).reshape(len(own), len(target.names)),
         whitened=np.array(whitened).reshape(len(whitened), len(target.whitening)),
         combinations=target.whitening * np.sqrt(np.diag(calibration.covariance)),
         labels=calibration.labels,
-        volume=float(np.median(volumes)) if volumes else np.nan,
+        volume=target.volume(again),
         failures=failures,
         trials=int(trials),
         seed=int(seed),
@@ -192,9 +193,25 @@ class _Target:
         return np.asarray(self.whitening @ coordinates(self.redraw.truth, found.cell))
 
     def volume(self, found: Calibration) -> float:
-        """Determinant of the trial's own covariance over the stated one, per coordinate."""
+        """Determinant of another covariance over the stated one, per coordinate."""
         own = self.whitening @ found.covariance @ self.whitening.T
         return float(np.exp(np.linalg.slogdet(own)[1] / len(own)))
+
+
+def _solved_again(redraw: Redraw) -> Calibration:
+    """The calibration's own spots, solved at once from its estimate."""
+    try:
+        again = calibrate(redraw.observations, initial=redraw.truth, options=redraw.options)
+    except LasercalError as error:
+        trouble = str(error)
+    else:
+        if again.fit.converged:
+            return again
+        trouble = again.fit.status
+    raise DataError(
+        "check-sigma: the calibration's own spots cannot be solved again from its estimate with "
+        f"its options: {trouble}"
+    )
 
 
 def _whitening(covariance: Array, free: Mask) -> Array:

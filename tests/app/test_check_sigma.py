@@ -115,24 +115,25 @@ def test_from_the_data_alone_gives_the_same_optimum(monkeypatch):
 def test_a_covariance_that_is_too_small_is_caught():
     found = lc.check_sigma(shrunk(paper(), 0.6), trials=60)
     assert not found.holds
-    spread, together = found.problems
-    assert spread.startswith("all 24 rows: spread 1.")
-    assert "the stated sigmas are not those of these spots" in spread
+    file, together = found.problems
+    assert file.startswith("all 24 rows: the stated sigma is not what the calibration's spots give")
+    assert "that is 1.67 times as large" in file
     assert together.startswith("all rows together")
+    assert "that is 2.78 times as large" in together
     assert found.nees.mean == pytest.approx(found.nees.dimension / 0.6**2, rel=0.15)
     expected = 2 * stats.norm.cdf(0.6 * 1.96) - 1
     share = np.mean([row.coverage_95.share for row in found.rows])
     assert share == pytest.approx(expected, abs=0.03)
+    assert np.mean([row.ratio for row in found.rows]) == pytest.approx(1 / 0.6, rel=0.1)
     # the trials' own intervals do not come from the file
     assert np.mean([row.own_coverage_95.share for row in found.rows]) > 0.92
 
 
 def test_one_sigma_that_is_too_small_is_named_alone():
     found = lc.check_sigma(shrunk(paper(), 0.5, "camera.v0"), trials=60)
-    spread, together = found.problems
-    assert spread.startswith("v0: spread ")
-    assert "camera.v0" in together or "not that of these spots" in together
+    assert found.problems[0].startswith("v0: the stated sigma is not")
     assert found["v0"].coverage_95.share < 0.85
+    assert all("v0" in words for words in found.problems)
 
 
 def test_a_covariance_alone_that_is_too_small_is_caught():
@@ -140,12 +141,13 @@ def test_a_covariance_alone_that_is_too_small_is_caught():
     found = lc.check_sigma(wrong, trials=40)
     (together,) = found.problems
     assert together.startswith("no row alone, but all together")
-    assert "the stated covariance is not that of these spots" in together
+    assert "that is 1.67 times as large. Calibrate anew" in together
 
 
 def test_sigmas_that_are_too_large_are_no_good_either():
-    found = lc.check_sigma(shrunk(paper(), 1.6), trials=60)
-    assert found.problems[0].startswith("all 24 rows: spread 0.")
+    found = lc.check_sigma(shrunk(paper(), 2.0), trials=40)
+    assert "that is 0.50 times as large" in found.problems[0]
+    assert np.mean([row.coverage_95.share for row in found.rows]) > 0.99
 
 
 def test_a_problem_that_bends_is_told_from_a_wrong_file():
@@ -154,7 +156,7 @@ def test_a_problem_that_bends_is_told_from_a_wrong_file():
     found = lc.check_sigma(lc.calibrate(made.observations, initial=made.truth), trials=100)
     assert not found.holds
     text = " ".join(found.problems)
-    assert "calibrate anew" not in text
+    assert "Calibrate anew" not in text
     assert "from about" in text
     assert abs(found["fu"].own_sigma / found["fu"].sigma - 1) < 0.2
 
@@ -385,6 +387,15 @@ def test_several_cameras():
     assert found.nees.mean == pytest.approx(found.nees.dimension, rel=0.2)
 
 
+def test_a_running_calibration_can_be_checked():
+    calibrator = IncrementalCalibrator(start())
+    calibrator.add(stream()[300:320])
+    found = lc.check_sigma(calibrator.calibration, trials=20)
+    assert found.spots + found.left_out == 320
+    for row in found.rows:
+        assert row.expected_sigma == pytest.approx(row.sigma, rel=0.05)
+
+
 # --- refusals -----------------------------------------------------------------------------------
 
 
@@ -454,7 +465,7 @@ def test_solves_that_fail_are_counted_and_told(monkeypatch):
 
     def now_and_then(*args, **kwargs):
         calls.append(0)
-        if len(calls) in (3, 7):
+        if len(calls) in (4, 8):  # the first solves the calibration's own spots
             raise lc.SolveError("no way")
         return real(*args, **kwargs)
 
@@ -466,12 +477,18 @@ def test_solves_that_fail_are_counted_and_told(monkeypatch):
 
 
 def test_no_solution_at_all_is_an_error(monkeypatch):
-    def never(*args, **kwargs):
-        raise lc.SolveError("no way")
+    real, calls = study.calibrate, []
 
-    monkeypatch.setattr(study, "calibrate", never)
+    def once(*args, **kwargs):
+        calls.append(0)
+        if len(calls) > 1:
+            raise lc.SolveError("no way")
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(study, "calibrate", once)
     with pytest.raises(lc.SolveError, match=r"20 of 20 trials have no solution.*trial 0: no way"):
         lc.check_sigma(paper(), trials=20)
+    refused(paper(), "own spots cannot be solved again from its estimate with its options: no way")
 
 
 # --- statistics ---------------------------------------------------------------------------------
@@ -485,6 +502,7 @@ def drawn_trials(seed: int, n: int = 200, rows: int = 24, factor=1.0, **changes)
         names=tuple(f"r{i}" for i in range(rows)),
         units=("px",) * rows,
         sigma=np.full(rows, 2.0),
+        expected_sigma=np.full(rows, 2.0),
         errors=2.0 * z,
         own_sigma=np.full((n, rows), 2.0),
         whitened=z,
