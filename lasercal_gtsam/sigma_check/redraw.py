@@ -13,7 +13,7 @@ it, like one more measurement. For a linear problem the error has the same distr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -295,7 +295,5 @@ def _free(calibration: Calibration, truth: Cell, holds: Holds) -> Mask:
 
 
 def _seen_at(truth: Cell, spots: Observations, T_base_hand: Array) -> Array:
-    names: Callable[[str], list[str]] = lambda kind: getattr(spots, kind).tolist()  # noqa: E731
-    return project(
-        truth, T_base_hand, plane=names("plane"), camera=names("camera"), laser=names("laser")
-    )
+    names = {kind: getattr(spots, kind).tolist() for kind in ("plane", "camera", "laser")}
+    return project(truth, T_base_hand, **names)
