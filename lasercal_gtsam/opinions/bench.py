@@ -7,7 +7,7 @@ the projector on the columns of the whitened derivative ``A``. Every opinion is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,7 @@ from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import point_jacobian, spot_on_beam
 from lasercal_gtsam.report_map import BEAM_TANGENT, CAMERA_TANGENT, PLANE_TANGENT, tangent_labels
+from lasercal_gtsam.rotations import rotation_exp
 
 Index = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -53,7 +54,7 @@ class Bench:
 
     Attributes
     ----------
-    observations : the spots used, input order
+    observations : the spots used, input order; with stated robot noise at the likeliest hand poses
     cell : the estimate
     labels : names of the free coordinates, m of them
     parts : (N, 2, 22) whitened derivative by each spot's own camera, laser and plane, per SI unit
@@ -160,7 +161,7 @@ def lay_out(calibration: Calibration) -> Bench:
     )
     problem = problem.anchored(problem.start)
     cell = problem.start
-    batch, S, B, unit = _whitened(calibration, cell)
+    batch, S, B, eta, unit = _whitened(calibration, cell)
     exact = unit < _EXACT_PX
     unit = max(unit, _EXACT_PX)
     strength = np.sqrt(calibration.spots.weight) / unit
@@ -176,9 +177,12 @@ def lay_out(calibration: Calibration) -> Bench:
             "misses the plane): the calibration is not one"
         )
     A, r = _system(problem, rows, np.einsum("nij,nj->ni", W, residual), used)
-    kept = seen[used]
+    kept, hands = seen[used], np.array(seen.T_base_hand[used])
+    hands[:, :3, 3] += eta[used, :3]
+    if eta.any():
+        hands[:, :3, :3] = hands[:, :3, :3] @ rotation_exp(eta[used, 3:])
     return Bench(
-        observations=kept,
+        observations=replace(kept, T_base_hand=hands),
         cell=cell,
         labels=tuple(
             label for label, free in zip(tangent_labels(cell), problem.free, strict=True) if free
@@ -205,8 +209,8 @@ def orientation_groups(
     return group_labels(observations.T_base_hand[:, :3, :3], plane, tolerance)
 
 
-def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, float]:
-    """Spots with their whole covariance, that covariance, the hand's derivative, and the scale."""
+def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, Array, float]:
+    """Spots with their whole covariance; it, the hand's derivative, corrections, and the scale."""
     seen, options = calibration.inputs.observations, calibration.inputs.options
     noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
     unit = calibration.fit.sigma0
@@ -214,7 +218,7 @@ def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, A
     if not noise.variances.any():
         cov = pixel_covariances(seen, options.sigma_px)
         B, _ = linearized(seen, cell, eta)
-        return make_batch(seen, options.sigma_px), cov, B, unit
+        return make_batch(seen, options.sigma_px), cov, B, eta, unit
     if options.sigma_px is None and np.isnan(seen.cov_uv).any():
         # the fit found the pixel sigma beside the stated noise of the hand: the scale is in it
         cov, unit = pixel_covariances(seen, unit), 1.0
@@ -226,7 +230,7 @@ def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, A
         eta[calibration.spots.weight <= 0] = 0.0
     B, _ = linearized(seen, cell, eta)
     S = cov + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
-    return corrected_batch(seen, cov, cell, noise, eta), S, B, unit
+    return corrected_batch(seen, cov, cell, noise, eta), S, B, eta, unit
 
 
 def _system(problem: CellGraph, rows: Array, residual: Array, used: Index) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lasercal_gtsam.api import calibrate
 from lasercal_gtsam.calibration import Calibration
-from lasercal_gtsam.errors import LasercalError
+from lasercal_gtsam.errors import DegenerateError, LasercalError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import beam_frames
 from lasercal_gtsam.opinions.bench import orientation_groups
@@ -91,6 +91,11 @@ def split(calibration: Calibration) -> Split:
     for which, mask in (("first", first), ("second", second)):
         try:
             part = calibrate(seen[mask], initial=calibration.cell, options=options)
+        except DegenerateError:
+            return _failed(
+                f"the {which} half alone does not determine the cell: take twice as many spots for "
+                "this opinion"
+            )
         except LasercalError as error:
             return _failed(f"the {which} half alone cannot be calibrated: {error}")
         if not part.fit.converged or not np.isfinite(part.fit.sigma0):

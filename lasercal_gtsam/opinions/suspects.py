@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.opinions.bench import BEAM, CAMERA, PLANE, Bench, Index, column_space
+from lasercal_gtsam.opinions.bench import BEAM, CAMERA, PLANE, Bench, Index
 from lasercal_gtsam.opinions.chances import f_above
 from lasercal_gtsam.rotations import basis_of
 from lasercal_gtsam.units import MM_PER_M
@@ -30,8 +30,9 @@ RIVAL_SCORE = 6.0
 most; Kass and Raftery, 1995)."""
 # moments at which something may have moved: so many, evenly, if there are more
 _MOST_MOMENTS = 12
-# what an amount may shrink to by the projection and still be tested
-_VISIBLE = 1e-5
+# share of a column that must be left by the projection for its amount to be tested: what the
+# calibration takes up to first order leaves such a share by the curvature of the model
+_VISIBLE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -110,10 +111,12 @@ def gain_of(bench: Bench, columns: Array) -> tuple[float, int]:
     """Fall of the sum of squares with these columns (2 N + P, k) admitted, and their rank."""
     length = np.linalg.norm(columns, axis=0)
     columns = columns[:, length > 0] / length[length > 0]
+    if not columns.size:
+        return 0.0, 0
     left = columns - bench.Q @ (bench.Q.T @ columns)
-    left = left[:, np.linalg.norm(left, axis=0) > _VISIBLE]
-    U = column_space(left, _VISIBLE)
-    return float(np.sum((U.T @ bench.residuals) ** 2)), U.shape[1]
+    U, s, _ = np.linalg.svd(left, full_matrices=False)
+    U = U[:, s > _VISIBLE]
+    return float(np.sum((U.T @ bench.residuals) ** 2)), int(U.shape[1])
 
 
 def _try(bench: Bench, suspect: Suspect, count: int) -> Finding | None:

@@ -187,6 +187,19 @@ def test_two_cameras_and_two_lasers_can_be_judged():
     assert {("camera", "left"), ("camera", "right")} <= kinds
 
 
+@pytest.mark.parametrize(
+    "stated", [{"hand_sigma_m": 1e-4}, {"hand_sigma_m": 1e-3, "sigma_px": 0.3}]
+)
+def test_stated_robot_noise_is_no_fault_of_the_robot(stated):
+    """The likeliest hand poses follow the residuals: no suspect may take that for evidence."""
+    noise = Noise(0.3, stated["hand_sigma_m"])
+    for seed in range(1, 4):
+        seen, made = capture("paper", seed, noise=noise)
+        result = lc.calibrate(seen, initial=made.truth, options=lc.CalibrationOptions(**stated))
+        verdict = lc.judge(result)
+        assert {r.code for r in verdict.reasons if r.severity != "note"} <= GEOMETRY
+
+
 def test_a_robust_loss_can_be_judged():
     seen, made = capture("table2-3", 1)
     options = lc.CalibrationOptions(robust="huber")
