@@ -210,10 +210,9 @@ def _lens(bench: Bench, name: str, rows: Index) -> Iterator[Suspect]:
         "camera", name, "lens", f"{words} (radially, or decentred)", bench.columns(blocks)
     )
     powers = [z[:, 0] ** a * z[:, 1] ** b for a in range(4) for b in range(4 - a) if a + b >= 2]
-    field = np.stack([np.kron(np.eye(2), f) for f in powers], axis=0)  # (K, 2, 2 N)
-    field = field.reshape(len(powers), 2, 2, len(rows)).transpose(3, 1, 0, 2)
+    field = np.stack(powers, axis=1)[:, None, None, :]
     blocks = np.zeros((len(bench), 2, 2 * len(powers)))
-    blocks[rows] = to_pixel @ field.reshape(len(rows), 2, -1)
+    blocks[rows] = (to_pixel[:, :, :, None] * field).reshape(len(rows), 2, -1)
     yield Suspect("camera", name, "lens", f"{words} (otherwise)", bench.columns(blocks))
 
 

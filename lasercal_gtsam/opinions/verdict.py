@@ -135,8 +135,8 @@ def judge(calibration: Calibration, *, halves: bool = False) -> Verdict:
             reasons.append(Reason("exact", "note", words, "Judge a real capture."))
         else:
             opinions = _opinions(calibration, bench, halves)
+            reasons += _of_opinions(opinions)  # a named cause before its effect
             reasons += _of_noise(calibration, bench)
-            reasons += _of_opinions(opinions)
         reasons += _of_geometry(bench)
     reasons += _of_coverage(calibration)
     reasons.sort(key=lambda reason: _ORDER[reason.severity])
@@ -225,7 +225,7 @@ def _of_noise(calibration: Calibration, bench: Bench) -> Iterator[Reason]:
                 "noise",
                 "bad" if fit.sigma0 > TOO_NOISY else "weak",
                 f"the residuals are {fit.sigma0:.1f} times what the stated noise explains",
-                "See what the levels and suspects below blame; else state the true noise.",
+                "See which fault or level the tables of 'lasercal judge' blame; else state the true noise.",
             )
         elif fit.sigma0 < QUIET and chi2_above(fit.dof * fit.sigma0**2, fit.dof) > 1 - UNLIKELY:
             yield Reason(
@@ -286,7 +286,7 @@ def _of_opinions(opinions: Opinions) -> Iterator[Reason]:
                 f"residuals-{test.name}",
                 "note" if test.name == "normal" else "weak",
                 f"it is not so that {test.asks} (chance {_chance(test.corrected)})",
-                "See what the levels and suspects blame.",
+                "See which fault or level the tables of 'lasercal judge' blame.",
             )
     known = [group for group in opinions.left_out if np.isfinite(group.chance)]
     for group in known:
@@ -308,7 +308,7 @@ def _of_opinions(opinions: Opinions) -> Iterator[Reason]:
             "weak",
             f"two halves of the spots disagree (chance {_chance(halves.chance)}); most in "
             f"{worst.name}, by {abs(worst.sigmas):.1f} sigma",
-            "See what the levels and suspects blame.",
+            "See which fault or level the tables of 'lasercal judge' blame.",
         )
 
 
