@@ -225,8 +225,8 @@ def _of_noise(calibration: Calibration, bench: Bench) -> Iterator[Reason]:
                 "noise",
                 "bad" if fit.sigma0 > TOO_NOISY else "weak",
                 f"the residuals are {fit.sigma0:.1f} times what the stated noise explains",
-                "See which fault or level the tables of 'lasercal judge' blame; else state the true "
-                "noise.",
+                "See which fault or level the tables of 'lasercal judge' blame; else state the "
+                "true noise.",
             )
         elif fit.sigma0 < QUIET and chi2_above(fit.dof * fit.sigma0**2, fit.dof) > 1 - UNLIKELY:
             yield Reason(
