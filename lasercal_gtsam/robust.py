@@ -9,6 +9,7 @@ mean what they say. On clean data nothing of this runs, and nothing changes, not
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -107,8 +108,8 @@ def rejection_length(count: int) -> float:
     captures, with a margin of two standard errors for the scale, a median.
     """
     count = max(count, 1)
-    quantile = float(np.sqrt(-2.0 * np.log(FALSE_ALARM / count)))
-    return quantile * float(1.0 + 2.0 * _MEDIAN_ERROR / np.sqrt(count))
+    quantile = math.sqrt(-2.0 * math.log(FALSE_ALARM / count))
+    return quantile * (1.0 + 2.0 * _MEDIAN_ERROR / math.sqrt(count))
 
 
 def robust_scale(lengths: Array, unknowns: int) -> float:

@@ -11,6 +11,7 @@ that made things worse is taken back, and a damped solution takes over.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -34,7 +35,7 @@ Marks = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
 
 # spots that a pass takes at each update, and the same where the hand is noisy (slower by far)
-SLICE, SLICE_HAND = 300, 150
+SLICE, SLICE_HAND = 200, 150
 # up to this many spots, all are relinearised within the update; with a noisy hand
 FEW, FEW_HAND = 1000, 250
 # joint distance in sigmas from the point of linearisation at which a pass begins
@@ -414,11 +415,12 @@ class Filter:
         self._R, z = stream_kernels.estimate(linear.H, self._about, linear.z, *self._constraints)
         state: State = self.chart.state(z)
         # a step too long for the linearisation may end where no camera can be
-        self._possible = bool(np.isfinite(z).all() and (state.cam_K[:, :2] > 0.0).all())
+        focal = state.cam_K[:, :2].ravel().tolist()
+        self._possible = math.isfinite(float(z @ z)) and all(f > 0.0 for f in focal)
         self.z = z if self._possible else linear.z
         self.now = state if self._possible else self.chart.state(linear.z)
         if self.dof >= 1:
-            self.scale = max(float(self._R[-1, -1]) / float(np.sqrt(self.dof)), _MIN_SCALE)
+            self.scale = max(float(self._R[-1, -1]) / math.sqrt(self.dof), _MIN_SCALE)
 
     def _count_unknowns(self) -> float:
         """Unknowns that spots (not soft priors) determine."""
