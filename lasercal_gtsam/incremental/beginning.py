@@ -140,7 +140,7 @@ def continued(store: SpotStore, calibration: Calibration, settings: Settings) ->
     prior = np.zeros((n + 1, n + 1))
     prior[:n, :n] = scale**2 * belief.information
     prior[n, n] = scale**2 * fit.dof
-    return Filter(
+    filter = Filter(
         store,
         belief.cell,
         np.diag(calibration.covariance) == 0.0,
@@ -151,6 +151,8 @@ def continued(store: SpotStore, calibration: Calibration, settings: Settings) ->
         scale=scale,
         robust=settings.robust,
     )
+    filter.folded = fit.n_spots * np.array([1.0, fit.rms_px**2])
+    return filter
 
 
 def holds_of(store: SpotStore, options: CalibrationOptions, cell: Cell) -> Holds:

@@ -109,7 +109,7 @@ class IncrementalCalibrator:
         self._watchman = Watchman(self._store, Cell({}, {}, {}), 0.0, 0.0)
         self._initial = Cell({}, {}, {})
         self._words: tuple[str, ...] = ()
-        self._older = self._older_used = 0
+        self._older = 0
         self._open: set[Named] = set()
         self._pending: list[int] = []
         self._missing: tuple[Missing, ...] = ()
@@ -263,7 +263,7 @@ class IncrementalCalibrator:
             self._store.append(spots, self._settings.sigma_px)
             self._begin(calibration, _start_words(calibration))
             return
-        self._older, self._older_used = fit.n_spots + fit.n_rejected, fit.n_spots
+        self._older = fit.n_spots + fit.n_rejected
         self._store = SpotStore(dict(spots.image_size))
         self._run(continued(self._store, calibration, self._settings), calibration)
         self._note("started", f"from a calibration of {fit.n_spots} spots, by its covariance")
@@ -277,8 +277,9 @@ class IncrementalCalibrator:
     def _run(self, filter: Filter, found: Calibration) -> None:
         self._filter = filter
         self._initial, self._words = found.initial, found.observability.held
-        outliers = float(self._older - self._older_used)
-        self._watchman = Watchman(self._store, filter.template, outliers, float(self._older_used))
+        fit = found.fit if self._older else None  # else the store tells
+        outliers, good = (fit.n_rejected, fit.n_spots) if fit else (0, 0)
+        self._watchman = Watchman(self._store, filter.template, outliers, good)
 
     def _audit(self) -> None:
         """While there are few spots, see whether a fresh start from all of them ends better."""
@@ -499,7 +500,7 @@ class IncrementalCalibrator:
             missing=self._missing,
             events=events,
             n_spots=self.n_spots,
-            n_used=0 if estimate is None else self._used(estimate),
+            n_used=0 if estimate is None else round(estimate.weight),
             sigma0=float("nan") if estimate is None else self._settings.unit * estimate.sigma0,
             rms_px=float("nan") if estimate is None else estimate.rms_px,
             _innovation=lambda: innovations_of(labels, seen),
@@ -512,9 +513,6 @@ class IncrementalCalibrator:
             self._next_row = self.n_spots + 1 if self.n_spots < _EVERY_SPOT else grown
             self._history.append(update)
         return update
-
-    def _used(self, estimate: Estimate) -> int:
-        return round(estimate.weight + self._running().folded) + self._older_used
 
     def _reason(self, seen: Innovation | None) -> str:
         limit = self._running().limit / self._running().scale

@@ -26,7 +26,8 @@ class Estimate:
     z : (n,) the estimate
     R : (n+1, n+1) square root of the information
     cost, dof : sum of squares (a-priori sigmas) and degrees of freedom
-    weight, square : number of the used spots, and their squared residuals (px^2)
+    weight, square : number of the used spots and their squared residuals (px^2), those that were
+        folded into the prior included
     """
 
     chart: CellChart

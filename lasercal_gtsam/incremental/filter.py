@@ -130,7 +130,7 @@ class Filter:
         self._pass: _Pass | None = None
         self._judged = 0
         self.end = store.first if end is None else end
-        self.folded = 0.0
+        self.folded = np.zeros(2)
         self.scale = scale
         self.robust = robust
         self.fallbacks = 0
@@ -151,6 +151,7 @@ class Filter:
         there = float(self._linear.H[-1, -1] + self._about[-1, -1])
         weight, square = self._linear.sums[:2]
         square *= cost / there if there > 0 else 1.0
+        weight, square = weight + self.folded[0], square + self.folded[1]
         return Estimate(
             self.chart, self.template, self.held, self.open, self.z, self._R,
             cost, self.dof, float(weight), float(square),
@@ -242,7 +243,7 @@ class Filter:
         part = self._subtract(self.store.first, end)
         self.prior = self.prior + about_origin(part.H, self._linear.z)
         self.prior_rows += 2.0 * float(part.sums[0])
-        self.folded += float(part.sums[0])
+        self.folded = self.folded + part.sums[:2]
         self.store.forget(end)
         self._pass = None
         self._solve()
@@ -331,6 +332,7 @@ class Filter:
     def _fade(self, factor: float) -> None:
         self.prior = factor * self.prior
         self.prior_rows *= factor
+        self.folded = factor * self.folded
         running = [self._pass.linear] if self._pass else []
         for linear in [self._linear, *running]:
             linear.H = factor * linear.H

@@ -175,7 +175,7 @@ def _fit(
     n_rejected: int,
     unit: float,
 ) -> Fit:
-    rms = rms_px(residuals) if len(residuals) else estimate.rms_px
+    rms = estimate.rms_px if account.older else rms_px(residuals)
     if troubles:
         status = "not to be trusted: " + "; ".join(troubles)
     else:
