@@ -383,6 +383,9 @@ def expect(record, path, view, now, R, weighing, scale, held, tie_from, tie_to, 
     e (2,) : residual, whitened by that covariance
     G (2, 13) : derivatives, whitened alike, by what may move: camera pose 6, beam 4, plane 3 (its
         distance as ``n . x = d``)
+    row (2, n+1) : what the spot adds to the square root of the information, by its own noise and at
+        the view: derivatives by the chart's coordinates, and the residual
+    square : of its pixel residual there, px^2
     """
     n = len(view.M)
     one = np.empty(1, np.int64)
@@ -412,6 +415,9 @@ def expect(record, path, view, now, R, weighing, scale, held, tie_from, tie_to, 
                 for k in range(max(0, j - 2), min(size[b], j + 3)):
                     v += J[i, start[b] + k] * view.M[at + k, at + j]
                 A[i, at + j] = v
+    row = np.empty((2, n + 1))
+    row[:, :n] = A
+    row[:, n] = J[:, 22]
     for t in range(len(tie_from)):
         A[:, tie_to[t]] += tie_ratio[t] * A[:, tie_from[t]]
     # covariance of the residual, whitened by the spot's own noise: I + V V^T, R^T V^T = A^T
@@ -451,4 +457,6 @@ def expect(record, path, view, now, R, weighing, scale, held, tie_from, tie_to, 
     covariance[0, 1] = u11 * (u00 * c01 + u01 * c11)
     covariance[1, 0] = covariance[0, 1]
     covariance[1, 1] = u11 * u11 * c11
-    return r, scale * scale * covariance, e, G
+    there = u00 * J[0, 22] + u01 * J[1, 22], u11 * J[1, 22]
+    square = there[0] * there[0] + there[1] * there[1]
+    return r, scale * scale * covariance, e, G, row, square

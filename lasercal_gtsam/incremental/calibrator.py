@@ -313,7 +313,7 @@ class IncrementalCalibrator:
                 limit = rejection_length(filter.count + 1) if filter.robust else np.inf
                 mark = USED if seen.chi2 <= limit * limit else LEFT_OUT
                 self._store.mark(number, number + 1, mark)
-        filter.use(number, number + 1)
+        filter.use(number, number + 1, seen)
         if self._alarm is None and since is None:
             filter.settle()
         elif since is not None:

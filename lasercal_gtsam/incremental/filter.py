@@ -28,7 +28,7 @@ from lasercal_gtsam.incremental.belief import POSE, Mask, marginalised
 from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.incremental.innovation import Innovation
 from lasercal_gtsam.incremental.soft_priors import Priors, soft_priors
-from lasercal_gtsam.incremental.store import SpotStore
+from lasercal_gtsam.incremental.store import LEFT_OUT, USED, SpotStore
 from lasercal_gtsam.robust import rejection_length
 
 Marks = npt.NDArray[np.uint8]
@@ -124,8 +124,8 @@ class Filter:
         self._soft = soft_priors(self.chart, cell, held, self.priors)
         tied = np.flatnonzero(~np.isnan(self.chart.aspect_array))
         self._ties = (15 * tied + 6, 15 * tied + 7, self.chart.aspect_array[tied])
-        noisy = bool(np.any(self.weighing.hand > 0))
-        self._slice, self._few = (SLICE_HAND, FEW_HAND) if noisy else (SLICE, FEW)
+        self._noisy = bool(np.any(self.weighing.hand > 0))
+        self._slice, self._few = (SLICE_HAND, FEW_HAND) if self._noisy else (SLICE, FEW)
         self._paths, self._offsets = np.empty((0, 3), np.int64), np.empty((0, 4), np.int64)
         self._pass: _Pass | None = None
         self._judged = 0
@@ -189,12 +189,18 @@ class Filter:
 
     # --- spots ----------------------------------------------------------------------------------
 
-    def use(self, begin: int, end: int) -> None:
-        """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew."""
+    def use(self, begin: int, end: int, seen: Innovation | None = None) -> None:
+        """Count the spots begin ... end-1, the newest, as they are marked; then estimate anew.
+
+        ``seen``: what `expect` gave for it, where it is one spot.
+        """
         self.end = end
         if self.weighing.fade < 1.0:
             self._fade(self.weighing.fade ** (end - begin))
-        self._add(self._linear, begin, end)
+        if seen is None or self._noisy:
+            self._add(self._linear, begin, end)
+        else:
+            self._add_row(begin, seen)
         self._solve()
 
     def settle(self) -> None:
@@ -356,6 +362,16 @@ class Filter:
             linear.sums = linear.sums + sums
             found.append((first, marks))
         return found
+
+    def _add_row(self, number: int, seen: Innovation) -> None:
+        """As `_add` for one spot, whose rows are there already."""
+        linear, mark = self._linear, self.store.mark_of(number)
+        if mark == USED:
+            linear.H = linear.H + seen.row.T @ seen.row
+            e, f = seen.row[:, -1].tolist()
+            linear.sums = linear.sums + np.array([1.0, seen.square, e * e + f * f, 0.0])
+        elif mark == LEFT_OUT:
+            linear.sums = linear.sums + np.array([0.0, 0.0, 0.0, 1.0])
 
     def _advance(self, running: _Pass) -> None:
         end = min(running.at + self._slice, self.end)

@@ -21,12 +21,16 @@ class Innovation(NamedTuple):
     e : (2,) whitened residual; NaN where no spot can be
     by_parts : (2, 13) whitened derivatives by what may move: the camera's rotation and translation
         in its own frame, the beam's slopes and offsets, the plane's tilt and distance
+    row, square : (2, n+1) what the spot adds to the square root of the information, and its squared
+        residual (px^2), both where that is linearised
     """
 
     residual_px: Array
     covariance_px2: Array
     e: Array
     by_parts: Array
+    row: Array
+    square: float
 
     @property
     def chi2(self) -> float:

@@ -222,6 +222,21 @@ def test_a_quadratic_moved_there_and_back_is_the_same():
     assert about_origin(there, z) == pytest.approx(quadratic)
 
 
+@pytest.mark.parametrize("aspect", [None, 1.01])
+def test_one_spot_adds_the_same_by_its_own_rows(spots, calibration, aspect):
+    slow, fast = (running(spots, calibration, aspects=(aspect,)) for _ in range(2))
+    for filter in (slow, fast):
+        filter.use(0, 100)
+        filter.store.mark(120, 121, LEFT_OUT)
+    slow.use(100, 130)
+    for k in range(100, 130):
+        fast.use(k, k + 1, fast.expect(k))
+    scale = np.sqrt(np.maximum(np.diag(slow._linear.H), 1e-12))
+    assert np.abs((fast._linear.H - slow._linear.H) / np.outer(scale, scale)).max() < 1e-12
+    assert fast._linear.sums == pytest.approx(slow._linear.sums, rel=1e-9)
+    assert fast.z == pytest.approx(slow.z, rel=1e-9, abs=1e-12)
+
+
 def test_taking_spots_out_is_never_having_had_them(spots, calibration):
     filter, without = (running(spots, calibration) for _ in range(2))
     filter.use(0, len(spots))
