@@ -17,11 +17,11 @@ import numpy as np
 
 from lasercal_factors.arrays import Array, Index, Spots, State
 from lasercal_factors.chart_kernels import move, normal_map, rotation
+from lasercal_factors.hand_kernels import by_hand, correct_hands, covariance_of, whitening_of
 from lasercal_factors.kernels import cholesky, constrain, information, jit, residuals, rows
 
 RECORD = 14
 LEFT_OUT, USED, HELD_BACK = 0, 1, 2
-_HAND_ROUNDS = 2
 
 
 class View(NamedTuple):
@@ -113,141 +113,6 @@ def gather(records, path, view):
             hands[3 * j + 2, k] = r[5 + a] * r[8 + b] - r[5 + b] * r[8 + a]
             hands[9 + j, k] = r[11 + j]
     return Spots(pixels, hands, blocks), order, offsets
-
-
-@jit
-def _by_hand(hand, block, state):
-    """Predicted pixel of one hand pose (12,), and its derivative by the pose, (2, 6).
-
-    By the translation in the base, then by the rotation in the hand (method 3.1, chain of 1-9).
-    """
-    c, l, p = block[0], block[1], block[2]  # noqa: E741
-    L, line = state.beam_R[l], state.beam_l[l]
-    R, t, K = state.cam_R[c], state.cam_t[c], state.cam_K[c]
-    n = state.plane_n[p]
-    u, q, b, x = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    for i in range(3):
-        u[i] = L[i, 0] * line[0] + L[i, 1] * line[1] + L[i, 2]
-        q[i] = state.beam_t[l, i] + L[i, 0] * line[2] + L[i, 1] * line[3]
-    for i in range(3):
-        b[i] = hand[3 * i] * u[0] + hand[3 * i + 1] * u[1] + hand[3 * i + 2] * u[2]
-        x[i] = hand[3 * i] * q[0] + hand[3 * i + 1] * q[1] + hand[3 * i + 2] * q[2] + hand[9 + i]
-    nb = n[0] * b[0] + n[1] * b[1] + n[2] * b[2]
-    s = (state.plane_d[p] - (n[0] * x[0] + n[1] * x[1] + n[2] * x[2])) / nb
-    y = np.empty(3)
-    for i in range(3):
-        y[i] = 0.0
-        for j in range(3):
-            y[i] += R[j, i] * (x[j] + s * b[j] - t[j])
-    a0, a1 = y[0] / y[2], y[1] / y[2]
-    k1, k2, p1, p2 = K[5], K[6], K[7], K[8]
-    r2 = a0 * a0 + a1 * a1
-    g, dg = 1.0 + r2 * (k1 + k2 * r2), k1 + 2.0 * k2 * r2
-    xd = g * a0 + 2.0 * p1 * a0 * a1 + p2 * (r2 + 2.0 * a0 * a0)
-    yd = g * a1 + p1 * (r2 + 2.0 * a1 * a1) + 2.0 * p2 * a0 * a1
-    uv = np.array([K[0] * xd + K[2] * yd + K[3], K[1] * yd + K[4]])
-    d00 = g + 2.0 * a0 * a0 * dg + 2.0 * p1 * a1 + 6.0 * p2 * a0
-    d01 = 2.0 * a0 * a1 * dg + 2.0 * p1 * a0 + 2.0 * p2 * a1
-    d11 = g + 2.0 * a1 * a1 * dg + 6.0 * p1 * a1 + 2.0 * p2 * a0
-    B = np.empty((2, 6))
-    for row in range(2):
-        if row == 0:
-            e0 = (K[0] * d00 + K[2] * d01) / y[2]
-            e1 = (K[0] * d01 + K[2] * d11) / y[2]
-        else:
-            e0, e1 = K[1] * d01 / y[2], K[1] * d11 / y[2]
-        e2 = -(e0 * a0 + e1 * a1)
-        along = 0.0
-        for i in range(3):
-            B[row, i] = R[i, 0] * e0 + R[i, 1] * e1 + R[i, 2] * e2
-            along += B[row, i] * b[i]
-        for i in range(3):
-            B[row, i] -= along / nb * n[i]
-        # a point s of the hand moves by R_hand (w x s): row . that = (s x (row R_hand)) . w
-        h = np.empty(3)
-        for j in range(3):
-            h[j] = B[row, 0] * hand[j] + B[row, 1] * hand[3 + j] + B[row, 2] * hand[6 + j]
-        for j in range(3):
-            v, w = (j + 1) % 3, (j + 2) % 3
-            B[row, 3 + j] = (q[v] + s * u[v]) * h[w] - (q[w] + s * u[w]) * h[v]
-    return uv, B
-
-
-@jit
-def _moved_hand(hand, eta):
-    """The hand pose (12,) corrected by ``eta`` (6,): translation in base, rotation in hand."""
-    turn, _ = rotation(eta[3:])
-    out = np.empty(12)
-    for i in range(3):
-        for j in range(3):
-            out[3 * i + j] = 0.0
-            for k in range(3):
-                out[3 * i + j] += hand[3 * i + k] * turn[k, j]
-        out[9 + i] = hand[9 + i] + eta[i]
-    return out
-
-
-@jit
-def _covariance(w00, w01, w11):
-    """Covariance ``(W^T W)^-1`` of a whitening: its upper triangle."""
-    v = 1.0 / (w11 * w11)
-    return (1.0 + w01 * w01 * v) / (w00 * w00), -w01 * v / w00, v
-
-
-@jit
-def _whitening(s00, s01, s11):
-    """``w00, w01, w11`` of upper triangular ``W`` with ``W^T W`` the inverse of a covariance."""
-    det = s00 * s11 - s01 * s01
-    w00 = math.sqrt(s11 / det)
-    return w00, -s01 / (det * w00), 1.0 / math.sqrt(s11)
-
-
-@jit
-def correct_hands(spots, state, hand):
-    """Move every hand pose to where it most likely was, in place; `hand_noise` has the method.
-
-    Residuals become ``r - B eta`` and the whitening that of ``cov_uv + B Sigma B^T``.
-    """
-    for block in spots.blocks:
-        for k in range(block[3], block[4]):
-            c00, c01, c11 = _covariance(spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k])
-            commanded = spots.hands[:, k].copy()
-            eta, moved, at = np.zeros(6), commanded, commanded
-            last = (c00, c01, c11, 0.0, 0.0)
-            good = True
-            for _ in range(_HAND_ROUNDS + 1):
-                uv, B = _by_hand(moved, block, state)
-                s00, s01, s11 = c00, c01, c11
-                r0, r1 = uv[0] - spots.pixels[0, k], uv[1] - spots.pixels[1, k]
-                for j in range(6):
-                    s00 += B[0, j] * hand[j] * B[0, j]
-                    s01 += B[0, j] * hand[j] * B[1, j]
-                    s11 += B[1, j] * hand[j] * B[1, j]
-                    r0 -= B[0, j] * eta[j]
-                    r1 -= B[1, j] * eta[j]
-                det = s00 * s11 - s01 * s01
-                good = math.isfinite(det) and math.isfinite(r0) and math.isfinite(r1)
-                if not good:
-                    break
-                shift0 = shift1 = 0.0
-                for j in range(6):
-                    shift0 += B[0, j] * eta[j]
-                    shift1 += B[1, j] * eta[j]
-                last = (s00, s01, s11, shift0, shift1)
-                at = moved
-                g0, g1 = (s11 * r0 - s01 * r1) / det, (s00 * r1 - s01 * r0) / det
-                eta = np.empty(6)
-                for j in range(6):
-                    eta[j] = -hand[j] * (B[0, j] * g0 + B[1, j] * g1)
-                moved = _moved_hand(commanded, eta)
-            if not good:
-                continue
-            s00, s01, s11, shift0, shift1 = last
-            spots.hands[:, k] = at
-            spots.pixels[0, k] += shift0
-            spots.pixels[1, k] += shift1
-            w00, w01, w11 = _whitening(s00, s01, s11)
-            spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k] = w00, w01, w11
 
 
 @jit
@@ -395,14 +260,14 @@ def expect(record, path, view, now, R, weighing, scale, held, tie_from, tie_to, 
     w = spots.pixels[2:, 0]
     if np.any(weighing.hand > 0.0):
         # with the noise of the hand, but at the commanded pose
-        _, B = _by_hand(spots.hands[:, 0].copy(), spots.blocks[0], now)
-        s00, s01, s11 = _covariance(w[0], w[1], w[2])
+        _, B = by_hand(spots.hands[:, 0].copy(), spots.blocks[0], now)
+        s00, s01, s11 = covariance_of(w[0], w[1], w[2])
         for j in range(6):
             s00 += B[0, j] * weighing.hand[j] * B[0, j]
             s01 += B[0, j] * weighing.hand[j] * B[1, j]
             s11 += B[1, j] * weighing.hand[j] * B[1, j]
         if math.isfinite(s00 * s11 - s01 * s01):
-            w[0], w[1], w[2] = _whitening(s00, s01, s11)
+            w[0], w[1], w[2] = whitening_of(s00, s01, s11)
     J = rows(spots, view.state)[0]
     A = np.zeros((2, n))
     start = (0, 6, 15, 19)

@@ -10,8 +10,8 @@ import numpy as np
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.errors import DataError, DegenerateError
-from lasercal_gtsam.graph import pixel_covariances
 from lasercal_gtsam.history import HistoryRow
+from lasercal_gtsam.incremental.alarms import looked_into
 from lasercal_gtsam.incremental.beginning import (
     begun,
     better_solution,
@@ -22,7 +22,6 @@ from lasercal_gtsam.incremental.beginning import (
     too_few,
 )
 from lasercal_gtsam.incremental.belief import Named, part_offset
-from lasercal_gtsam.incremental.diagnosis import Diagnosis, diagnose
 from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.innovation import Innovation, innovations_of
@@ -38,6 +37,7 @@ from lasercal_gtsam.incremental.parts import (
 from lasercal_gtsam.incremental.result import Account, calibration_of, parameters_of
 from lasercal_gtsam.incremental.settings import Settings
 from lasercal_gtsam.incremental.store import HELD_BACK, LEFT_OUT, USED, SpotStore
+from lasercal_gtsam.incremental.trace import Trace
 from lasercal_gtsam.incremental.update import (
     Alarm,
     Event,
@@ -55,14 +55,6 @@ from lasercal_gtsam.robust import rejection_length
 # growth between attempts to find a first solution, and between repetitions of it while few spots
 # are there, up to this many
 _ATTEMPT_GROWTH, _AUDIT_GROWTH, _AUDITED = 1.15, 1.33, 300
-# spots behind an alarm that must be there before anything is done by itself, up to which it is
-# looked into at each spot, then at every fifth, and up to which at all
-_FEWEST, _AT_EACH, _DIAGNOSED = 6, 20, 40
-_ADVICE = (
-    "state that noise (hand_sigma_m, hand_sigma_rad) and calibrate anew, or find out what is loose"
-)
-# history: a row for each spot up to the first number, then at this growth
-_EVERY_SPOT, _HISTORY_GROWTH = 200, 1.01
 # a window is folded into the prior in pieces of this share of it
 _FOLDED_SHARE = 1 / 8
 
@@ -117,8 +109,8 @@ class IncrementalCalibrator:
         self._since = 0
         self._events: list[Event] = []
         self._reported = 0
-        self._history: list[Update] = []
-        self._next_attempt = self._next_audit = self._next_row = 0
+        self._trace = Trace()
+        self._next_attempt = self._next_audit = 0
         if calibration is not None:
             self._go_on_from(calibration)
         self._last = self._update(range(0), [])
@@ -165,15 +157,7 @@ class IncrementalCalibrator:
     @property
     def history(self) -> tuple[HistoryRow, ...]:
         """The table at moments that grow rarer, at every event, and now."""
-        updates = list(self._history)
-        if updates and updates[-1].n_spots < self.n_spots:
-            updates.append(self._last)
-        return tuple(
-            HistoryRow(
-                u.n_spots, u.rms_px, u.sigma0, u.parameters, tuple(e.words for e in u.events)
-            )
-            for u in updates
-        )
+        return self._trace.rows(self._last)
 
     # --- what can be done -----------------------------------------------------------------------
 
@@ -337,45 +321,23 @@ class IncrementalCalibrator:
 
     def _examine(self, alarm: Alarm) -> None:
         """Which cause explains the spots since the alarm best; act where that is sure."""
-        count = self._store.end - self._since
-        if alarm.causes and (count > _DIAGNOSED or (count > _AT_EACH and count % 5)):
-            self._alarm = replace(alarm, spots=count)
-            return
-        found = self._diagnosis()
-        causes, why = ((), found) if isinstance(found, str) else (found.causes, found.words)
-        words = f"since spot {alarm.since}: {why}"
-        self._alarm = replace(alarm, spots=count, causes=causes, words=words)
+        self._alarm, cause = looked_into(
+            alarm,
+            self._since,
+            self._store,
+            self._running(),
+            self._open,
+            self._settings,
+            self._watchman.outlier_rate,
+        )
         if not alarm.words:
-            self._note("alarm", words)
-        if isinstance(found, str) or not found.settled or count < _FEWEST:
+            self._note("alarm", self._alarm.words)
+        if cause is None or cause.kind == "robot":
             return
-        cause = found.causes[0]
         if cause.kind == "outliers":
             self._end_alarm("withdrawn", f"nothing has moved since spot {alarm.since}: outliers")
-        elif cause.kind == "robot":
-            self._alarm = replace(self._alarm, words=f"{words}; {_ADVICE}")
         elif self._settings.automatic:
             self._free([(cause.kind, cause.name)], cause.words)
-
-    def _diagnosis(self) -> Diagnosis | str:
-        """What explains the spots since the alarm, or why that cannot be told."""
-        filter = self._running()
-        end = min(self._store.end, self._since + _DIAGNOSED)
-        spots = self._store.observations(self._since, end)
-        good = determined(spots, filter.template, self._open)
-        if not good.any():
-            return "something has changed; its spots are of parts that are not known yet"
-        cov_uv = filter.scale**2 * pixel_covariances(spots, self._settings.sigma_px)
-        try:
-            return diagnose(
-                filter.estimate.belief(),
-                spots[good],
-                cov_uv[good],
-                outlier_rate=self._watchman.outlier_rate,
-                hand_noise=self._settings.hand,
-            )
-        except DegenerateError as error:
-            return f"something has changed; what it is cannot be told: {error}"
 
     def _end_alarm(self, kind: EventKind, words: str) -> None:
         """Take the spots that were held back as they are."""
@@ -508,10 +470,7 @@ class IncrementalCalibrator:
             _parameters=lambda: () if estimate is None else parameters_of(estimate, initial),
             _calibration=self._answer(estimate),
         )
-        if estimate is not None and (events or self.n_spots >= self._next_row):
-            grown = int(np.ceil(_HISTORY_GROWTH * self.n_spots))
-            self._next_row = self.n_spots + 1 if self.n_spots < _EVERY_SPOT else grown
-            self._history.append(update)
+        self._trace.record(update)
         return update
 
     def _reason(self, seen: Innovation | None) -> str:
