@@ -162,7 +162,8 @@ def accumulate(records, path, mark, view, noise, limit, judge, age):
                 continue
             w = noise.fade ** (age - i) if noise.fade < 1.0 else 1.0
             if judge:
-                mark[i] = USED if lengths2[k] <= limit * limit else LEFT_OUT
+                possible = math.isfinite(lengths2[k])
+                mark[i] = USED if possible and lengths2[k] <= limit * limit else LEFT_OUT
             if mark[i] != USED:
                 sums[3] += w
                 continue

@@ -295,7 +295,8 @@ class IncrementalCalibrator:
             since = self._watchman.look(number, self._store, filter, seen)
             if since is None:
                 limit = rejection_length(filter.count + 1) if filter.robust else np.inf
-                mark = USED if seen.chi2 <= limit * limit else LEFT_OUT
+                good = np.isfinite(seen.chi2) and seen.chi2 <= limit * limit
+                mark = USED if good else LEFT_OUT
                 self._store.mark(number, number + 1, mark)
         filter.use(number, number + 1, seen)
         if self._alarm is None and since is None:

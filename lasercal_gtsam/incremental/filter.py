@@ -44,9 +44,12 @@ _MOVED = 0.05
 _SETTLED, _ROUNDS = 0.01, 8
 # a pass begins also when this many more spots are there than at the last (outliers are judged anew)
 _GROWN = 1.25
-# an accepted step may raise the error by this many squared sigmas (rounding, marks)
-_WORSE = 1.0
-_LEVENBERG, _RESTED = 12, 1.1
+# by how much (squared sigmas) an accepted step may raise the error: in the background marks are
+# stale, within an update there is rounding only
+_WORSE, _ROUNDING = 1.0, 1e-6
+# residual (sigmas) that a spot counts with where it cannot be, if none is an outlier
+_FAR = 1e4
+_LEVENBERG, _STIFF, _RESTED = 40, 1e6, 1.1
 # weight below which a fading spot is forgotten, and the least residual scale (exact data)
 _FADED, _MIN_SCALE = 1e-9, 1e-7
 
@@ -217,8 +220,8 @@ class Filter:
             self._pass = self._new_pass(self.z)
         if self._pass is not None:
             self._advance(self._pass)
-            if self._pass.at >= self.end:
-                self._take_over(self._pass)
+            if self._pass.at >= self.end and not self._take_over(self._pass, _WORSE):
+                self._damped()
 
     def relinearise(self, settled: float | None = None) -> None:
         """Gauss-Newton over all spots until the estimate has settled (sigmas); cost linear.
@@ -231,11 +234,10 @@ class Filter:
         for _ in range(_ROUNDS):
             if self.moved <= (settled or _SETTLED) and not self._grown():
                 return
-            if not self._possible:
-                self._damped()
-                return
-            if not self._take_over(self._whole_pass(self.z)):
-                return
+            if not (self._possible and self._take_over(self._whole_pass(self.z), _ROUNDING)):
+                break
+        if self.moved > (settled or _SETTLED):
+            self._damped()
 
     def take_out(self, begin: int, end: int, mark: int) -> None:
         """Take the spots begin ... end-1 out of the estimate and mark them."""
@@ -378,12 +380,11 @@ class Filter:
         running.marks += self._add(running.linear, running.at, end, judge=True)
         running.at = end
 
-    def _take_over(self, running: _Pass) -> bool:
-        """Make the pass the linearisation; False where it was worse and damping took over."""
+    def _take_over(self, running: _Pass, slack: float) -> bool:
+        """Make the pass the linearisation; False where it is worse by ``slack`` squared sigmas."""
         self._pass = None
         before, after = self._loss(self._linear), self._loss(running.linear)
-        if not after <= before + _WORSE * self.scale**2 + 1e-3 * before:
-            self._damped()
+        if not after <= before + slack * (self.scale**2 + 1e-3 * before):
             return False
         self._accept(running)
         return True
@@ -399,7 +400,7 @@ class Filter:
         """Levenberg's way down from the point of linearisation, over all spots (cost linear)."""
         self.fallbacks += 1
         n = self.chart.n
-        damping = 1e-3
+        damping = 1e-4
         for _ in range(_LEVENBERG):
             linear = self._linear
             extra = np.zeros_like(linear.H)
@@ -414,16 +415,20 @@ class Filter:
                     return
             else:
                 damping *= 10.0
-        # no way down from here: more spots may show one, the same ones will not
-        self._rest_until = _RESTED * self.count
+                if damping > _STIFF:
+                    break
+        # no way down from here: where there are many spots, wait for some more before trying again
+        if self.count > self._few:
+            self._rest_until = _RESTED * self.count
 
     def _loss(self, linear: _Linear) -> float:
         """Truncated loss, by one limit for all linearisations that are compared."""
         if not np.isfinite(linear.H[0, 0]):
             return float("inf")
         prior = about_point(self.prior, linear.z)[-1, -1] + linear.soft[-1, -1]
-        left_out = self.limit**2 * linear.sums[3] if self.robust else 0.0
-        return float(linear.sums[2] + left_out + prior)
+        # where all spots count, those left out are the ones that cannot be: no step may lead there
+        limit = self.limit if self.robust else _FAR * self.scale
+        return float(linear.sums[2] + limit**2 * linear.sums[3] + prior)
 
     def _solve(self) -> None:
         linear = self._linear
