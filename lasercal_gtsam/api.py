@@ -176,7 +176,7 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
     return Calibration(
         cell=cell,
         initial=start,
-        parameters=table_parameters(solution.cell, _restricted(start, solution.cell), uncertainty),
+        parameters=table_parameters(solution.cell, start.restricted(solution.cell), uncertainty),
         covariance=uncertainty.covariance,
         labels=uncertainty.labels,
         fit=fit,
@@ -228,15 +228,6 @@ def _fit(
         status=status,
         n_spots=len(residuals),
         n_rejected=n_rejected,
-    )
-
-
-def _restricted(cell: Cell, like: Cell) -> Cell:
-    """The parts of ``cell`` that ``like`` has, in its order."""
-    return Cell(
-        {name: cell.cameras[name] for name in like.cameras},
-        {name: cell.lasers[name] for name in like.lasers},
-        {name: cell.planes[name] for name in like.planes},
     )
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -151,6 +151,17 @@ class Plane(FrozenData):
         return self.distance * self.normal_base
 
 
+class _Named(Protocol):
+    """Has cameras, lasers and planes by name."""
+
+    @property
+    def cameras(self) -> Iterable[str]: ...
+    @property
+    def lasers(self) -> Iterable[str]: ...
+    @property
+    def planes(self) -> Iterable[str]: ...
+
+
 @dataclass(frozen=True)
 class Cell:
     """Everything that is calibrated, by name."""
@@ -167,6 +178,14 @@ class Cell:
             ):
                 raise DataError(f"Cell.{name}: expected a dict of name -> {kind.__name__}")
             object.__setattr__(self, name, dict(found))
+
+    def restricted(self, like: _Named) -> Cell:
+        """The parts that ``like`` (a cell, or observations) has, in its order."""
+        return Cell(
+            {name: self.cameras[name] for name in like.cameras},
+            {name: self.lasers[name] for name in like.lasers},
+            {name: self.planes[name] for name in like.planes},
+        )
 
     def with_planes(self, planes: Mapping[str, Plane]) -> Cell:
         """Return a copy with other planes."""

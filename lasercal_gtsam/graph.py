@@ -6,6 +6,7 @@ for all spots and one for all priors. The only module that reads or writes `gtsa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -183,6 +184,19 @@ def cell_from_state(state: State, template: Cell) -> Cell:
         name: Plane(state.plane_n[i], state.plane_d[i]) for i, name in enumerate(template.planes)
     }
     return Cell(cameras, lasers, planes)
+
+
+def expansion(aspects: Sequence[float | None], free: npt.NDArray[np.bool_]) -> Array:
+    """(n, n_free): free coordinates to all of them; tied focal lengths (``fu``) follow ``fv``.
+
+    ``aspects``: of each camera, as in the chart; ``free`` (n,), where a tied ``fu`` is not.
+    """
+    E = np.eye(len(free))
+    for c, aspect in enumerate(aspects):
+        if aspect is not None:
+            fu = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("fu")
+            E[fu, fu + 1] = aspect
+    return E[:, free]
 
 
 def beam_frames(cell: Cell) -> dict[str, BeamFrame]:

@@ -14,7 +14,7 @@ from lasercal_factors.batch import Loss
 from lasercal_gtsam.calibration import Parameter, WeakDirection
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph, beam_frames, state_from_cell
+from lasercal_gtsam.graph import CellGraph, beam_frames, expansion, state_from_cell
 from lasercal_gtsam.losses import loss_weights, sensitivity_and_spread
 from lasercal_gtsam.observability import RangeSvd
 from lasercal_gtsam.report_map import (
@@ -79,7 +79,7 @@ def estimate_uncertainty(solution: Solution) -> Uncertainty:
     values = problem.start_values()
     svd = refuse_if_singular(problem, values)
     dof = degrees_of_freedom(problem, values)
-    E = _expansion(problem)
+    E = expansion(problem.chart.aspects, problem.free)
     if problem.loss.name == "none":
         sigma0 = float(np.sqrt(solution.cost / dof)) if dof >= 1 else float("nan")
         unit = sigma0 / problem.scale
@@ -190,13 +190,3 @@ def report_notes(cell: Cell, uncertainty: Uncertainty) -> list[str]:
                 "its normal and distance"
             )
     return notes
-
-
-def _expansion(problem: CellGraph) -> Array:
-    """(n, n_free): free coordinates to all of them; tied focal lengths move together."""
-    E = np.eye(problem.chart.n)
-    for c, aspect in enumerate(problem.chart.aspects):
-        if aspect is not None:
-            fu = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("fu")
-            E[fu, fu + 1] = aspect
-    return E[:, problem.free]

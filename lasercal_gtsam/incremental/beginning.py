@@ -163,11 +163,7 @@ def holds_of(store: SpotStore, options: CalibrationOptions, cell: Cell) -> Holds
     if not len(seen):
         return Holds(np.zeros(len(labels), np.bool_), {}, {}, frozenset(), {}, ())
     holds = resolve_holds(seen, options, cell)
-    ordered = Cell(
-        {name: cell.cameras[name] for name in seen.cameras},
-        {name: cell.lasers[name] for name in seen.lasers},
-        {name: cell.planes[name] for name in seen.planes},
-    )
+    ordered = cell.restricted(seen)
     where = dict(zip(tangent_labels(ordered), holds.held.tolist(), strict=True))
     held = [where.get(label, False) for label in labels]
     return replace(holds, held=np.array(held, dtype=np.bool_))

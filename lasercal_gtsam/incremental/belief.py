@@ -25,7 +25,13 @@ from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError, DegenerateError, SolveError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CELL_KEY, beam_frames, cell_from_state, state_from_cell
+from lasercal_gtsam.graph import (
+    CELL_KEY,
+    beam_frames,
+    cell_from_state,
+    expansion,
+    state_from_cell,
+)
 from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.report_map import (
@@ -40,6 +46,8 @@ Part = Literal["camera", "laser", "plane"]
 Named = tuple[Part, str]
 Mask = npt.NDArray[np.bool_]
 POSE = 6  # the camera's pose comes first of its coordinates
+# coordinates that a move changes: of a camera its pose
+MOVABLE: dict[Part, int] = {"camera": POSE, "laser": 4, "plane": 3}
 _MAX_ITERATIONS = 100
 _CONVERGED_SIGMAS = 0.1
 
@@ -90,10 +98,10 @@ class Belief:
     def columns(self, kind: Part, name: str) -> slice:
         """Columns of a part; of a camera its pose only."""
         names = {"camera": self.cell.cameras, "laser": self.cell.lasers, "plane": self.cell.planes}
-        at = part_offset(self.cell, kind, name)
         if name not in names[kind]:
             raise DataError(f"{kind} {name!r} is not in the cell, which has {sorted(names[kind])}")
-        return slice(at, at + {"camera": POSE, "laser": 4, "plane": 3}[kind])
+        at = part_offset(self.cell, kind, name)
+        return slice(at, at + MOVABLE[kind])
 
     def without(self, columns: slice) -> Belief:
         """Forget these columns: the rest keeps exactly what it knows (marginalised, by Schur)."""
@@ -106,6 +114,11 @@ class Belief:
         information[where, where] += 1.0 / np.asarray(sigmas, dtype=np.float64) ** 2
         information[self.held], information[:, self.held] = 0.0, 0.0
         return replace(self, information=information)
+
+    @property
+    def expansion(self) -> Array:
+        """(n, n_free): free coordinates to all of them; see `graph.expansion`."""
+        return expansion([self.aspect.get(name) for name in self.cell.cameras], ~self.held)
 
     @property
     def covariance(self) -> Array:
@@ -124,7 +137,7 @@ class Belief:
                 f"{len(weak)} combination(s) of unknowns are not determined: "
                 + "; ".join(f"({i + 1}) {w.words}" for i, w in enumerate(weak))
             )
-        E = expansion(self.cell, self.held, self.aspect)
+        E = self.expansion
         return np.asarray(E @ svd.covariance() @ E.T)
 
 
@@ -290,16 +303,6 @@ def marginalised(information: Array, columns: slice, held: Mask) -> Array:
     rest = information[np.ix_(b, b)] - (B / scale[:, None]).T @ X
     out[np.ix_(b, b)] = 0.5 * (rest + rest.T)
     return out
-
-
-def expansion(cell: Cell, held: Mask, aspect: Mapping[str, float]) -> Array:
-    """(n, n_free): free coordinates to all of them; tied focal lengths move together."""
-    E = np.eye(len(held))
-    for c, name in enumerate(cell.cameras):
-        if name in aspect:
-            fu = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index("fu")
-            E[fu, fu + 1] = aspect[name]
-    return E[:, ~held]
 
 
 def calibrated_parts(calibration: Calibration) -> Cell:

@@ -21,13 +21,12 @@ from lasercal_gtsam.incremental.beginning import (
     holds_its_spots,
     too_few,
 )
-from lasercal_gtsam.incremental.belief import Named, part_offset
+from lasercal_gtsam.incremental.belief import MOVABLE, Named, part_offset
 from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.innovation import Innovation, innovations_of
 from lasercal_gtsam.incremental.parts import (
     KINDS,
-    MOVABLE,
     Found,
     find_part,
     parts_of,

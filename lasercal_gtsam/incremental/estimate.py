@@ -10,8 +10,8 @@ from lasercal_factors.chart import CellChart
 
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import cell_from_state
-from lasercal_gtsam.incremental.belief import Belief, Mask, carried, cell_tangent_map, expansion
+from lasercal_gtsam.graph import cell_from_state, expansion
+from lasercal_gtsam.incremental.belief import Belief, Mask, carried, cell_tangent_map
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Estimate:
         free = np.flatnonzero(~fixed)
         R = self.R[np.ix_(free, free)]
         root = np.linalg.inv(R) if np.all(np.diag(R) > 0) else np.full_like(R, np.nan)
-        E = expansion(self.template, fixed, self._aspect)
+        E = expansion(self.chart.aspects, ~fixed)
         J = cell_tangent_map(self.chart, self.z, self.state) @ E @ root
         covariance = np.asarray(self.sigma0**2 * J @ J.T)
         constant = ~np.any(E != 0, axis=1) & ~self.open

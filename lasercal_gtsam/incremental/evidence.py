@@ -32,7 +32,7 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import cell_from_state, state_from_cell
-from lasercal_gtsam.incremental.belief import Belief, expansion, part_offset
+from lasercal_gtsam.incremental.belief import Belief, part_offset
 from lasercal_gtsam.observations import Observations
 
 Index = npt.NDArray[np.int64]
@@ -248,7 +248,7 @@ def _square_root(belief: Belief, columns: Index) -> Array:
     L = np.zeros((len(free), len(rows)))
     L[np.searchsorted(free, rows)] = scale[:, None] * np.linalg.inv(C).T
     whole = np.zeros((n, len(rows)))
-    whole[columns] = (expansion(belief.cell, belief.held, belief.aspect) @ L)[columns]
+    whole[columns] = (belief.expansion @ L)[columns]
     # as few standard normal numbers as there are columns
     R = np.asarray(np.linalg.qr(whole[columns].T)[1])
     out = np.zeros((n, len(R)))

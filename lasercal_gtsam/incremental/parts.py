@@ -10,7 +10,7 @@ import numpy as np
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.incremental.beginning import holds_of
-from lasercal_gtsam.incremental.belief import Named, Part, part_offset
+from lasercal_gtsam.incremental.belief import MOVABLE, Named, Part, part_offset
 from lasercal_gtsam.incremental.filter import Filter
 from lasercal_gtsam.incremental.relocate import (
     locate_camera,
@@ -24,8 +24,6 @@ from lasercal_gtsam.options import DISTORTION_NAMES, CalibrationOptions
 from lasercal_gtsam.report_map import CAMERA_TANGENT, tangent_labels
 
 KINDS: tuple[Part, ...] = ("camera", "laser", "plane")
-# coordinates that a move changes: of a camera its pose
-MOVABLE: dict[Part, int] = {"camera": 6, "laser": 4, "plane": 3}
 
 
 def parts_of(cell: Cell, kind: Part) -> dict[str, Camera] | dict[str, Beam] | dict[str, Plane]:

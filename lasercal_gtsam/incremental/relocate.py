@@ -17,7 +17,7 @@ from lasercal_factors.batch import Loss
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
 from lasercal_gtsam.errors import DataError, DegenerateError
-from lasercal_gtsam.incremental.belief import Part
+from lasercal_gtsam.incremental.belief import MOVABLE, Part
 from lasercal_gtsam.incremental.change import TURNS, change_basis, middle_of_spots
 from lasercal_gtsam.incremental.part_fit import PartFit, fit_part
 from lasercal_gtsam.incremental.part_starts import (
@@ -34,7 +34,6 @@ TURN_RANGE, SHIFT_RANGE = 0.1, 0.05
 # starts that are refined; camera poses this near each other (rad, m) lead to the same end
 _REFINED: dict[Part, int] = {"camera": 3, "laser": 1, "plane": 1}
 _NEAR_POSE = 0.1
-_SIZE: dict[Part, int] = {"camera": 6, "laser": 4, "plane": 3}
 # tangent coordinates of a camera with unknown intrinsics, the fullest set first, and the sigmas to
 # which the spots must determine the intrinsics: fu, fv (relative), skew, u0, v0 (px), k1 k2 p1 p2
 _LENSES = tuple(
@@ -228,7 +227,7 @@ def _fits(
         if kind == "camera" and intrinsics is None:
             fit = _fit_new_camera(begin, observations, name)
         else:
-            fit = fit_part(begin, observations, kind, name, LOSS, range(_SIZE[kind]))
+            fit = fit_part(begin, observations, kind, name, LOSS, range(MOVABLE[kind]))
         fits.append(fit)
         if len(fits) == _REFINED[kind]:
             break

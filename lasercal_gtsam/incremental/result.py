@@ -20,6 +20,7 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, pixel_covariances, state_from_cell
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
+from lasercal_gtsam.incremental.beginning import determined
 from lasercal_gtsam.incremental.estimate import Estimate
 from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.observations import Observations
@@ -135,8 +136,7 @@ def calibration_of(
 def _residuals(cell: Cell, seen: Observations, account: Account) -> tuple[Array, Array]:
     """Pixels (N, 2) and whitened lengths (N,) of spots whose parts are all known; else NaN."""
     residuals, lengths = np.full((len(seen), 2), np.nan), np.full(len(seen), np.inf)
-    known = np.isin(seen.camera, list(cell.cameras)) & np.isin(seen.laser, list(cell.lasers))
-    rows = np.flatnonzero(known & np.isin(seen.plane, list(cell.planes)))
+    rows = np.flatnonzero(determined(seen, cell))
     if not len(rows):
         return residuals, lengths
     spots, options = seen[rows], account.options
@@ -144,11 +144,7 @@ def _residuals(cell: Cell, seen: Observations, account: Account) -> tuple[Array,
     residuals[rows] = project(cell, spots.T_base_hand, **names) - spots.uv
     cov = pixel_covariances(spots, account.sigma_px)
     noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
-    part = Cell(
-        {name: cell.cameras[name] for name in spots.cameras},
-        {name: cell.lasers[name] for name in spots.lasers},
-        {name: cell.planes[name] for name in spots.planes},
-    )
+    part = cell.restricted(spots)
     if max(noise) > 0:
         eta = np.zeros((len(spots), 6))
         for _ in range(_HAND_ROUNDS):
