@@ -7,9 +7,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from lasercal_gtsam import __version__
 from lasercal_gtsam.engine.work import Done, Work
 from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.io.calibration_file import program_version
 from lasercal_gtsam.io.journal import Journal, JournalReader
 
 _CHUNK = "chunk"
@@ -31,7 +31,7 @@ class Record:
     """
 
     def __init__(self, path: str | Path, work: Work) -> None:
-        about = {"work": work.name, "version": __version__, "spec": dict(work.spec)}
+        about = {"work": work.name, "version": program_version(), "spec": dict(work.spec)}
         self._journal = Journal.open(path, about)
         try:
             _refuse_others(self._journal, about)

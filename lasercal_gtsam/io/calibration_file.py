@@ -59,7 +59,7 @@ def to_dict(
         "initial": cell_to_dict(calibration.initial),
         "inputs": inputs,
         "provenance": {
-            "version": _program_version(),
+            "version": program_version(),
             "created": created.isoformat(timespec="seconds"),
             "sha256": _digest(inputs),
             "files": dict(sources or {}),
@@ -147,7 +147,8 @@ def _inputs(inputs: Inputs) -> dict[str, Any]:
     }
 
 
-def _program_version() -> str:
+def program_version() -> str:
+    """Version of the installed package; "unknown" where it is not installed."""
     try:
         return metadata.version("lasercal-gtsam")
     except metadata.PackageNotFoundError:

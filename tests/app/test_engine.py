@@ -173,7 +173,7 @@ def test_a_cluster_that_does_not_answer_is_refused():
     pytest.importorskip("distributed")
     from lasercal_gtsam.engine import Cluster
 
-    with pytest.raises(DataError, match="no cluster answers at 'tcp://127.0.0.1:9'"):
+    with pytest.raises(DataError, match=r"no cluster answers at 'tcp://127\.0\.0\.1:9'"):
         run_all(Work("draws", draw, SPEC, 3), Cluster("tcp://127.0.0.1:9", patience_s=0.5))
 
 
