@@ -7,12 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 
+from lasercal_gtsam.detect.crop import OUTSIDE, View, as_bgr8, cut, stretched
 from lasercal_gtsam.detect.detection import Detection
 from lasercal_gtsam.errors import DetectionError
 
-Sheet = npt.NDArray[np.uint8]
+Sheet = View
 
 _TEXT_ROWS = 30  # px under each tile
 _GAP = 4
@@ -21,7 +21,6 @@ _MIN_TILE = 64
 _CROP_SIGMAS = 8.0
 _MIN_CROP = 32  # px of the picture that a tile shows at least
 _FONT = cv2.FONT_HERSHEY_SIMPLEX
-_BACKGROUND = 24
 _WHITE = (235, 235, 235)
 # BGR by what the verdict means: taken, found but not taken, nothing there
 _COLOURS = {"used": (90, 220, 90), "none": (150, 150, 150), "ambiguous": (60, 190, 255)}
@@ -71,7 +70,7 @@ def contact_sheet(
     room = min(_MAX_SHEET // columns - _GAP, _MAX_SHEET // rows - _GAP - _TEXT_ROWS)
     tile = int(max(min(tile, room), _MIN_TILE))
     pitch = (tile + _TEXT_ROWS + _GAP, tile + _GAP)
-    sheet = np.full((rows * pitch[0] + _GAP, columns * pitch[1] + _GAP, 3), _BACKGROUND, np.uint8)
+    sheet = np.full((rows * pitch[0] + _GAP, columns * pitch[1] + _GAP, 3), OUTSIDE, np.uint8)
     drawn = 0
     for picture, detection, name in zip(pictures, detections, names, strict=False):
         row, column = divmod(drawn, columns)
@@ -85,15 +84,15 @@ def contact_sheet(
 
 def _tile(picture: Any, detection: Detection, name: str, size: int) -> Sheet:
     colour = _COLOURS.get(detection.verdict, _REFUSED)
-    view = _view(picture)
+    view = as_bgr8(picture)
     box = _crop_box(detection, view.shape)
-    crop = _stretched(_cut(view, box))
+    crop = stretched(cut(view, box))
     scale = size / box[2]
     image = cv2.resize(crop, (size, size), interpolation=cv2.INTER_NEAREST)
     if np.isfinite(detection.uv).all():
         _draw_spot(image, detection, box, scale, colour)
     _draw_inset(image, view, detection, box, colour)
-    strip = np.full((_TEXT_ROWS, size, 3), _BACKGROUND, np.uint8)
+    strip = np.full((_TEXT_ROWS, size, 3), OUTSIDE, np.uint8)
     scale_text = 0.4 if size >= 120 else 0.3
     cv2.putText(strip, _ascii(name), (2, 11), _FONT, scale_text, _WHITE, 1, cv2.LINE_AA)
     line = detection.verdict + ("" if not detection.single_frame else " (single)")
@@ -102,19 +101,6 @@ def _tile(picture: Any, detection: Detection, name: str, size: int) -> Sheet:
         line += f" {sigma:.2f}px"
     cv2.putText(strip, line, (2, 25), _FONT, scale_text, colour, 1, cv2.LINE_AA)
     return np.vstack([np.asarray(image, dtype=np.uint8), strip])
-
-
-def _view(picture: Any) -> Sheet:
-    """Picture as 8-bit BGR, brightened to its own maximum where it uses more or fewer bits."""
-    picture = np.asarray(picture)
-    if picture.ndim == 3:
-        picture = picture[..., :3]
-    if picture.dtype != np.uint8:
-        top = max(float(picture.max()), 1e-12)
-        picture = np.clip(picture * (255.0 / top), 0, 255).astype(np.uint8)
-    if picture.ndim == 2 or picture.shape[2] == 1:
-        picture = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_GRAY2BGR)
-    return np.asarray(picture, dtype=np.uint8)
 
 
 def _crop_box(detection: Detection, shape: tuple[int, ...]) -> tuple[int, int, int]:
@@ -126,24 +112,6 @@ def _crop_box(detection: Detection, shape: tuple[int, ...]) -> tuple[int, int, i
     side = int(np.clip(2 * _CROP_SIGMAS * detection.sigma_major, _MIN_CROP, max(width, height)))
     u, v = (round(float(x)) for x in detection.uv)
     return u - side // 2, v - side // 2, side
-
-
-def _cut(view: Sheet, box: tuple[int, int, int]) -> Sheet:
-    """Square crop, dark where it leaves the picture."""
-    u0, v0, side = box
-    crop = np.full((side, side, 3), _BACKGROUND, np.uint8)
-    left, top = max(u0, 0), max(v0, 0)
-    right, bottom = min(u0 + side, view.shape[1]), min(v0 + side, view.shape[0])
-    if right > left and bottom > top:
-        crop[top - v0 : bottom - v0, left - u0 : right - u0] = view[top:bottom, left:right]
-    return crop
-
-
-def _stretched(crop: Sheet) -> Sheet:
-    """Brightness from the crop's darkest to its brightest: a faint spot shows as well."""
-    low, high = (float(x) for x in np.percentile(crop, (1.0, 100.0)))
-    scale = 255.0 / max(high - low, 1.0)
-    return np.asarray(np.clip((crop - low) * scale, 0, 255), dtype=np.uint8)
 
 
 def _draw_spot(

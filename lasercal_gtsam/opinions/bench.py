@@ -150,6 +150,8 @@ def lay_out(calibration: Calibration) -> Bench:
     """
     seen, options = calibration.inputs.observations, calibration.inputs.options
     fit = calibration.fit
+    if not (calibration.spots.weight > 0).any():
+        raise DataError("the calibration does not hold its spots: there are no residuals to judge")
     if not np.isfinite(fit.sigma0):
         raise DataError(
             "the calibration has no degrees of freedom left: nothing checks it; add spots"

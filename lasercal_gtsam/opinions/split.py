@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from lasercal_gtsam.api import calibrate
 from lasercal_gtsam.calibration import Calibration
-from lasercal_gtsam.errors import DegenerateError, LasercalError
+from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import beam_frames
 from lasercal_gtsam.opinions.bench import orientation_groups
@@ -75,13 +75,17 @@ def halves(calibration: Calibration) -> npt.NDArray[np.bool_]:
     return out
 
 
-def split(calibration: Calibration) -> Split:
-    """Calibrate both halves from the whole's estimate and compare them.
+def fit_halves(calibration: Calibration) -> tuple[Calibration, Calibration]:
+    """Calibrate each half alone, from the whole's estimate and with the whole's outliers left out.
 
-    The halves share no spot, so that the covariance of the difference is the sum of theirs, both
-    with the noise of the whole. With priors they share those, and differ less than that.
+    Raises
+    ------
+    SolveError
+        A half cannot be calibrated; the message says which, and why.
     """
     seen, options = calibration.inputs.observations, calibration.inputs.options
+    if not (calibration.spots.weight > 0).any():
+        raise SolveError("the calibration does not hold its spots, so there are no halves of them")
     # outliers were told apart by all the spots; half of them might disagree about that
     if options.robust in ("auto", "gnc-tls"):
         options = replace(options, robust="none")
@@ -92,26 +96,36 @@ def split(calibration: Calibration) -> Split:
         try:
             part = calibrate(seen[mask], initial=calibration.cell, options=options)
         except DegenerateError:
-            return _failed(
+            raise SolveError(
                 f"the {which} half alone does not determine the cell: take twice as many spots for "
                 "this opinion"
-            )
+            ) from None
         except LasercalError as error:
-            return _failed(f"the {which} half alone cannot be calibrated: {error}")
+            raise SolveError(f"the {which} half alone cannot be calibrated: {error}") from error
         if not part.fit.converged or not np.isfinite(part.fit.sigma0):
-            return _failed(f"the {which} half alone: {part.fit.status}")
+            raise SolveError(f"the {which} half alone: {part.fit.status}")
         found.append(part)
-    return _compare(calibration, *found)
+    if any(part.labels != calibration.labels for part in found):
+        raise SolveError("a half has no spots of some camera, laser or plane")
+    return found[0], found[1]
 
 
-def _failed(words: str) -> Split:
-    return Split((), float("nan"), 0, float("nan"), words)
+def split(
+    calibration: Calibration, parts: tuple[Calibration, Calibration] | None = None
+) -> Split:
+    """Compare the two halves, which `fit_halves` gives unless they are at hand.
+
+    The halves share no spot, so that the covariance of the difference is the sum of theirs, both
+    with the noise of the whole. With priors they share those, and differ less than that.
+    """
+    try:
+        first, second = parts or fit_halves(calibration)
+    except SolveError as error:
+        return Split((), float("nan"), 0, float("nan"), str(error))
+    return _compare(calibration, first, second)
 
 
 def _compare(whole: Calibration, a: Calibration, b: Calibration) -> Split:
-    labels = whole.labels
-    if a.labels != labels or b.labels != labels:
-        return _failed("a half has no spots of some camera, laser or plane")
     charts = {name: BeamChart.of(beam) for name, beam in whole.cell.lasers.items()}
     names = row_names(whole.cell, charts)
     difference = row_values(a.cell, charts) - row_values(b.cell, charts)

@@ -60,6 +60,7 @@ WORTH_A_LOOK = 0.01
 UNLIKELY = FAULT_CHANCE
 """Chance below which a test speaks against a calibration."""
 
+_LOOK = "Let 'lasercal check' look for the cause in the capture."
 _ORDER: dict[str, int] = {"bad": 0, "weak": 1, "note": 2}
 
 
@@ -123,6 +124,8 @@ def judge(calibration: Calibration, *, halves: bool = False) -> Verdict:
     -------
     Verdict
     """
+    if not len(calibration.inputs.observations):
+        return _unheld(calibration)
     reasons = list(_of_fit(calibration))
     opinions = Opinions()
     try:
@@ -146,6 +149,21 @@ def judge(calibration: Calibration, *, halves: bool = False) -> Verdict:
     return Verdict(grade, tuple(reasons), action, opinions)
 
 
+def _unheld(calibration: Calibration) -> Verdict:
+    """Of a calibration that does not hold its spots: there is nothing to check it by."""
+    action = "Judge the calibration that holds the spots, or take some to check it by."
+    reason = Reason(
+        "no-spots",
+        "weak",
+        "the calibration does not hold its spots: nothing can be checked but what it says itself",
+        action,
+    )
+    if calibration.fit.converged:
+        return Verdict("weak", (reason,), action, Opinions())
+    failed = Reason("not-converged", "bad", calibration.fit.status, _LOOK)
+    return Verdict("bad", (failed, reason), _LOOK, Opinions())
+
+
 def _opinions(calibration: Calibration, bench: Bench, halves: bool) -> Opinions:
     return Opinions(
         accuse(bench),
@@ -163,7 +181,7 @@ def _of_fit(calibration: Calibration) -> Iterator[Reason]:
             "not-converged",
             "bad",
             fit.status,
-            "Let 'lasercal check' look for the cause in the capture.",
+            _LOOK,
         )
     yield from _of_rejected_groups(calibration)
     total = fit.n_spots + fit.n_rejected
