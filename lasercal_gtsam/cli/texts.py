@@ -6,19 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from lasercal_gtsam.cli.console import bullets, wrapped
+from lasercal_gtsam.report.words import count as count
+from lasercal_gtsam.report.words import noise_sentence
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
     from lasercal_gtsam.io.spot_account import RowSpot, SpotAccount
 
 _MOST_LINES = 20
-# residuals this many times larger than the stated noise deserve a word
-_SUSPICIOUS = 1.5
-
-
-def count(number: int, noun: str) -> str:
-    """``1 spot``, ``2 spots``."""
-    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
 
 
 def looked_at(account: SpotAccount) -> int:
@@ -74,30 +69,6 @@ def result_lines(calibration: Calibration, table: str | None = None) -> list[str
     if not calibration.fit.converged:  # otherwise they are part of the status
         lines += _section("Remarks:", observability.notes)
     return lines
-
-
-def noise_sentence(calibration: Calibration) -> str:
-    """What sigma0 means here: a pixel sigma, or a check of the stated noise."""
-    import numpy as np
-
-    fit, options = calibration.fit, calibration.inputs.options
-    if not np.isfinite(fit.sigma0):
-        return "There are as many unknowns as measurements: no sigmas can be stated."
-    behind = f"{fit.dof:.0f} degrees of freedom"
-    pixels_stated = (
-        options.sigma_px is not None or not np.isnan(calibration.inputs.observations.cov_uv).all()
-    )
-    hand_stated = options.hand_sigma_m > 0 or options.hand_sigma_rad > 0
-    if not (pixels_stated or hand_stated):
-        return f"Noise of a pixel coordinate, from the residuals: {fit.sigma0:.3g} px ({behind})."
-    noise = "the stated noise" if pixels_stated else "1 px and the stated noise of the hand"
-    text = f"The residuals are {fit.sigma0:.3g} times what {noise} explains ({behind})"
-    if fit.sigma0 > _SUSPICIOUS:
-        return (
-            f"{text}: poses, planes or the camera are less exact than stated. The sigmas are "
-            "widened by that factor."
-        )
-    return f"{text}; the sigmas are scaled by that factor."
 
 
 def _section(heading: str, lines: Sequence[str]) -> list[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lasercal_gtsam.frozen import Array
 
-# edges of a square: 0 bottom, 1 right, 2 top, 3 left; corners from the lower left, counter-clockwise
+# edges of a square: 0 bottom, 1 right, 2 top, 3 left; corners counter-clockwise, lower left first
 _CASES: dict[int, tuple[tuple[int, int], ...]] = {
     1: ((3, 0),), 2: ((0, 1),), 3: ((3, 1),), 4: ((1, 2),), 6: ((0, 2),), 7: ((3, 2),),
     8: ((2, 3),), 9: ((2, 0),), 11: ((2, 1),), 12: ((1, 3),), 13: ((1, 0),), 14: ((0, 3),),
@@ -87,7 +87,7 @@ def _joined(links: dict[_Node, list[_Node]]) -> list[list[_Node]]:
 
 
 def even_levels(low: float, high: float, count: int) -> Array:
-    """Multiples of a round step between ``low`` and ``high`` (exclusive), about ``count`` of them."""
+    """About ``count`` multiples of a round step between ``low`` and ``high`` (exclusive)."""
     if not 0 <= low < high < np.inf:
         return np.zeros(0)
     step = round_up((high - low) / count)

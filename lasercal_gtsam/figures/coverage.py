@@ -67,7 +67,9 @@ def image_coverages(calibration: Calibration) -> tuple[ImageCoverage, ...]:
         uv = seen.uv[rows]
         border = hull(uv)
         fields = (_COLUMNS, max(1, round(_COLUMNS * h / w)))
-        edges = [np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip((w, h), fields, strict=True)]
+        edges = [
+            np.linspace(-0.5, size - 0.5, n + 1) for size, n in zip((w, h), fields, strict=True)
+        ]
         counts = np.histogram2d(uv[:, 1], uv[:, 0], bins=(edges[1], edges[0]))[0]
         shown = sampled(rows)
         found.append(
@@ -175,5 +177,3 @@ def _rejected(
         return np.zeros((0, 2))
     low, high = corners.min(axis=0), corners.max(axis=0)
     return np.asarray(xy[((xy >= low) & (xy <= high)).all(axis=1)])
-
-

@@ -143,9 +143,7 @@ def error_map(
     cell, seen = calibration.cell, calibration.inputs.observations
     part = cell.cameras[camera]
     axes = PlaneAxes.of(cell.planes[plane], part)
-    rows = np.flatnonzero(
-        used_spots(calibration) & (seen.plane == plane) & (seen.camera == camera)
-    )
+    rows = np.flatnonzero(used_spots(calibration) & (seen.plane == plane) & (seen.camera == camera))
     xy = axes.to_plane_mm(places_of_spots(calibration, rows))
     xy = xy[np.isfinite(xy).all(axis=1)]
     border, view = hull(xy), view_outline(cell, plane, camera, axes)

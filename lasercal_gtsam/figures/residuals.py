@@ -107,7 +107,9 @@ def residual_fields(calibration: Calibration) -> tuple[ResidualField, ...]:
                 rms_px=_rms(lengths),
                 mean_px=residual[rows].mean(axis=0) if len(rows) else np.zeros(2),
                 largest_px=float(lengths.max(initial=0.0)),
-                means=_means(seen.uv[rows], residual[rows], size) if len(shown) < len(rows) else None,
+                means=_means(seen.uv[rows], residual[rows], size)
+                if len(shown) < len(rows)
+                else None,
             )
         )
     return tuple(found)

@@ -97,7 +97,6 @@ class Scene(FrozenData):
 
 def scene(calibration: Calibration) -> Scene:
     """The calibrated cell with its spots, beams, hand poses and uncertainties."""
-    cell, seen = calibration.cell, calibration.inputs.observations
     out = rejected_spots(calibration)
     used = np.flatnonzero(~out)
     places = places_of_spots(calibration, used)
@@ -342,4 +341,3 @@ def _eye(calibration: Calibration, centre: Array) -> tuple[float, float]:
     first = next(iter(calibration.cell.cameras.values()))
     x, y, _ = first.T_base_camera[:3, 3] - centre
     return float(np.degrees(np.arctan2(y, x))) + 50.0, 25.0
-

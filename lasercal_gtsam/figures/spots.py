@@ -40,9 +40,13 @@ def places_of_spots(calibration: Calibration, rows: Index) -> Array:
     NaN where a ray misses its plane.
     """
     seen = calibration.inputs.observations
-    return spot_on_ray(
-        calibration.cell,
-        seen.uv[rows],
-        plane=seen.plane[rows].tolist(),
-        camera=seen.camera[rows].tolist(),
-    ) if len(rows) else np.zeros((0, 3))
+    return (
+        spot_on_ray(
+            calibration.cell,
+            seen.uv[rows],
+            plane=seen.plane[rows].tolist(),
+            camera=seen.camera[rows].tolist(),
+        )
+        if len(rows)
+        else np.zeros((0, 3))
+    )

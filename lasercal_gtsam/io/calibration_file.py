@@ -67,6 +67,11 @@ def to_dict(
     }
 
 
+def inputs_digest(calibration: Calibration) -> str:
+    """SHA-256 of spots and options: the same for two results from the same inputs."""
+    return _digest(_inputs(calibration.inputs))
+
+
 def save_calibration(
     calibration: Calibration,
     path: str | Path,

@@ -110,9 +110,7 @@ def fit_halves(calibration: Calibration) -> tuple[Calibration, Calibration]:
     return found[0], found[1]
 
 
-def split(
-    calibration: Calibration, parts: tuple[Calibration, Calibration] | None = None
-) -> Split:
+def split(calibration: Calibration, parts: tuple[Calibration, Calibration] | None = None) -> Split:
     """Compare the two halves, which `fit_halves` gives unless they are at hand.
 
     The halves share no spot, so that the covariance of the difference is the sum of theirs, both

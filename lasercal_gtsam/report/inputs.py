@@ -1,0 +1,130 @@
+"""What a calibration was made from and with, so that it can be made again."""
+
+from __future__ import annotations
+
+import platform
+import shlex
+from collections.abc import Iterator
+from dataclasses import fields
+from importlib import metadata
+from typing import Any
+
+from lasercal_gtsam.io.calibration_file import inputs_digest
+from lasercal_gtsam.io.plain import plain
+from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.report.material import Material
+
+_PACKAGES = ("lasercal-gtsam", "gtsam", "numpy", "scipy", "numba", "opencv-python-headless")
+_FILE, _REPORT = "calibration.json", "report.html"
+_OPTIONS = {
+    "sigma_px": "pixel sigma of spots without one of their own; none: from the residuals",
+    "hand_sigma_m": "robot noise of a hand position, metres a coordinate",
+    "hand_sigma_rad": "robot noise of a hand orientation, radians an axis",
+    "robust": "what is done about outliers",
+    "distortion": "distortion terms that are estimated",
+    "known": "held at these values",
+    "fixed": "held at the start's values",
+    "priors": "Gaussian priors on rows of the table: mean, sigma",
+    "max_iterations": "limit of one solve",
+    "seed": "of whatever draws numbers",
+}
+
+
+def inputs_section(material: Material) -> dict[str, Any]:
+    """Files and hashes, options, versions, and the commands that repeat the run."""
+    calibration, origin = material.calibration, material.origin
+    options = calibration.inputs.options
+    return {
+        "heading": "Inputs",
+        "words": [
+            "The same spots and options give the same numbers, to the last digit, with the same "
+            "versions on the same kind of machine."
+        ],
+        "missing": None,
+        "files": [{"name": name, "sha256": digest} for name, digest in origin.files.items()],
+        "calibration": {"name": origin.file, "sha256": origin.sha256} if origin.file else None,
+        "inputs_sha256": inputs_digest(calibration),
+        "calibrated": origin.created or None,
+        "made_with": origin.version or None,
+        "versions": {
+            "python": platform.python_version(),
+            "platform": platform.platform(terse=True),
+            **{name: _version(name) for name in _PACKAGES},
+        },
+        "options": [
+            {
+                "name": f.name,
+                "value": _text(getattr(options, f.name)),
+                "words": _OPTIONS.get(f.name, ""),
+            }
+            for f in fields(options)
+        ],
+        "commands": list(_commands(material)),
+        "n_spots": len(calibration.inputs.observations),
+    }
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def _text(value: Any) -> str:
+    """An option as a person writes it."""
+    value = plain(value)
+    if value is None or value in ([], {}):
+        return "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} = {_text(item)}" for name, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
+def _commands(material: Material) -> Iterator[dict[str, str]]:
+    origin, options = material.origin, material.calibration.inputs.options
+    file = origin.file or _FILE
+    # what a capture holds is named first in its provenance
+    capture = next((name for name in origin.files if name.endswith((".yaml", ".yml"))), None)
+    line = _calibrate(options, capture, file) if capture else None
+    if line:
+        yield {"words": "Calibrate the capture again.", "command": line}
+    if len(material.calibration.inputs.observations):
+        yield {
+            "words": "Calibrate again from the spots and options in the calibration itself, in "
+            "Python.",
+            "command": "import lasercal_gtsam as lc\n"
+            f"inputs = lc.load_calibration({file!r}).inputs\n"
+            "again = lc.calibrate(inputs.observations, options=inputs.options)",
+        }
+    words = shlex.join(["lasercal", "report", file, "-o", _REPORT])
+    yield {"words": "Make this report again.", "command": words}
+
+
+def _calibrate(options: CalibrationOptions, capture: str, file: str) -> str | None:
+    """The command that gives these options; None where the command line has no word for one.
+
+    Noise and known values that the capture states need not be repeated, and do no harm.
+    """
+    default = CalibrationOptions()
+    if options.priors or (options.max_iterations, options.seed) != (
+        default.max_iterations,
+        default.seed,
+    ):
+        return None
+    words = ["lasercal", "calibrate", capture]
+    if options.distortion != default.distortion:
+        terms = options.distortion
+        words += ["--distortion", terms if isinstance(terms, str) else ",".join(terms)]
+    if options.robust != default.robust:
+        words += ["--robust", options.robust]
+    if options.sigma_px is not None:
+        words += ["--sigma-px", f"{options.sigma_px!r}"]
+    for name, value in options.known.items():
+        numbers = value if isinstance(value, tuple | list) else (value,)
+        words += ["--known", f"{name}={','.join(f'{x!r}' for x in numbers)}"]
+    for name in options.fixed:
+        words += ["--fixed", name]
+    return shlex.join([*words, "-o", file])
