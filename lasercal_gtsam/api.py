@@ -20,8 +20,9 @@ from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError, DegenerateError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
-from lasercal_gtsam.hand_noise import refine_with_hand_noise
+from lasercal_gtsam.hand_noise.refine import refine_with_hand_noise
 from lasercal_gtsam.holds import Holds, resolve_holds
+from lasercal_gtsam.losses import THRESHOLDS
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.random_parts import parts_of
@@ -89,8 +90,10 @@ def calibrate(
     ways = _given_start(initial) if initial is not None else _closed_form_starts(search)
 
     def finish(solution: Solution, rejected: Mask) -> Finished:
-        if options.hand_sigma_m > 0 or options.hand_sigma_rad > 0:
-            return Finished(*refine_with_hand_noise(search, solution, rejected))
+        if options.noisy_hand:
+            found = refine_with_hand_noise(search, solution, rejected)
+            levels = found.levels
+            return Finished(*found[:3], levels.found, levels.words)
         return Finished(solution, lengths_of(search, solution.cell))
 
     if options.robust == "none":
@@ -105,6 +108,21 @@ def calibrate(
     if initial is not None:
         accepted = accepted._replace(start=initial)
     return assemble(search, accepted)
+
+
+def stop_notes(observations: Observations, options: CalibrationOptions) -> list[str]:
+    """A word where hand poses repeat to the last digit, and it was not said what that means."""
+    if observations.stop is not None or not options.noisy_hand:
+        return []
+    poses = observations.T_base_hand.reshape(len(observations), -1)
+    repeated = len(poses) - len(np.unique(poses, axis=0))
+    if not repeated:
+        return []
+    return [
+        f"{repeated} hand poses are those of other spots to the last digit; each counts as another "
+        "visit with an error of its own. Where the hand stood still between them, give these spots "
+        "the same stop"
+    ]
 
 
 def _given_start(initial: Cell) -> Ways:
@@ -161,7 +179,8 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
     The residuals refer to the spots as observed, with the commanded hand poses.
     """
     observations, options, batch = search.observations, search.options, search.batch
-    (solution, _, sigma_px), reasons, start, weights = accepted
+    finished, reasons, start, weights = accepted
+    solution, sigma_px = finished.solution, finished.sigma_px
     uncertainty = estimate_uncertainty(solution)
     if sigma_px is not None:  # found on the way; what is left of the scale is about 1
         uncertainty = replace(uncertainty, sigma0=sigma_px * uncertainty.sigma0)
@@ -172,7 +191,13 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
     weights = used.astype(np.float64) if weights is None else weights
     warnings = fold_warnings(solution.cell)
     fit = _fit(solution, uncertainty, residuals[used], weights[used], int((~used).sum()), warnings)
-    notes = (*warnings, *report_notes(solution.cell, uncertainty))
+    fit = replace(fit, noise=finished.noise)
+    notes = (
+        *warnings,
+        *report_notes(solution.cell, uncertainty),
+        *finished.words,
+        *stop_notes(observations, options),
+    )
     return Calibration(
         cell=cell,
         initial=start,
@@ -247,6 +272,12 @@ def _check_request(
         raise DataError("calibrate: there are no spots")
     if initial is not None and not isinstance(initial, Cell):
         raise DataError(f"initial: expected a Cell, got {type(initial).__name__}")
+    if options.noisy_hand and observations.shared_stops and options.robust in THRESHOLDS:
+        raise DataError(
+            f"options.robust: {options.robust!r} weighs spots one by one, which those of one stop "
+            "with a common error of the hand cannot be; use 'auto', 'gnc-tls' or 'none', or leave "
+            "Observations.stop out"
+        )
     if options.distortion == "auto":
         raise DataError(
             "options.distortion: 'auto' is not available yet; use 'all', 'none' or names out of "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.observations import Names, Observations
-from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.options import HAND_NOISE_NAMES, CalibrationOptions
 from lasercal_gtsam.prediction import CellUncertainty, locate, only, predict
 
 
@@ -32,6 +32,25 @@ class Parameter:
 
 
 @dataclass(frozen=True)
+class NoiseLevel:
+    """A noise level that was estimated from the residuals, 1 sigma per axis.
+
+    Attributes
+    ----------
+    name : ``sigma_px`` (px), ``hand_sigma_m`` (metres) or ``hand_sigma_rad`` (radians)
+    value : the estimate; 0 where the residuals show nothing of it
+    standard_error : of ``value``; NaN where it is 0
+    low, high : 95 % interval; ``high`` is infinite where the spots say nothing about it
+    """
+
+    name: str
+    value: float
+    standard_error: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Fit:
     """How the fit went.
 
@@ -45,6 +64,7 @@ class Fit:
     converged : whether every check passed
     status : one sentence for a human
     n_spots, n_rejected : spots used and spots left out as outliers
+    noise : the noise levels that were estimated (``CalibrationOptions.estimate_noise``)
     """
 
     rms_px: float
@@ -55,6 +75,7 @@ class Fit:
     status: str
     n_spots: int
     n_rejected: int
+    noise: tuple[NoiseLevel, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -183,6 +204,11 @@ class Calibration(FrozenData):
                 return parameter
         raise KeyError(f"{name!r}; there are {', '.join(p.name for p in self.parameters)}")
 
+    @property
+    def options_used(self) -> CalibrationOptions:
+        """The options with the hand's noise that was estimated as if it had been stated."""
+        return with_levels(self.inputs.options, self.fit.noise)
+
     def table(self) -> str:
         """Text of the paper's Table 2: Initial | Refined | sigma | Unit, RMS row last."""
         lines = [("", "Initial", "Refined", "sigma", "Unit")]
@@ -265,11 +291,23 @@ class Calibration(FrozenData):
 
         save_calibration(self, path)
 
+    def report(self, path: str | Path, *, document: str | Path | None = None) -> None:
+        """Write the uncertainty report as one HTML file; ``document``: its content, as JSON too."""
+        from lasercal_gtsam.report.file import report
+
+        report(self, path, document=document)
+
     def to_dict(self) -> dict[str, Any]:
         """The content of ``calibration.json``."""
         from lasercal_gtsam.io.calibration_file import to_dict
 
         return to_dict(self)
+
+
+def with_levels(options: CalibrationOptions, noise: Sequence[NoiseLevel]) -> CalibrationOptions:
+    """Options that state the hand's noise which was found, instead of asking for it."""
+    found: dict[str, Any] = {n.name: n.value for n in noise if n.name in HAND_NOISE_NAMES}
+    return replace(options, estimate_noise=(), **found) if found else options
 
 
 def table_row(p: Parameter) -> tuple[str, str, str, str, str]:

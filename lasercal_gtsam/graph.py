@@ -199,6 +199,27 @@ def expansion(aspects: Sequence[float | None], free: npt.NDArray[np.bool_]) -> A
     return E[:, free]
 
 
+def spread_columns(rows: Array, cell: Cell, observations: Observations) -> Array:
+    """Derivatives (N, r, 22) by each spot's own parts as ones by all coordinates, (N, r, n).
+
+    ``rows`` as the kernels give them: camera 15, beam 4, plane 3 (its offset with GTSAM's sign).
+    ``cell`` has the observed parts in the observations' order.
+    """
+    sizes = (len(CAMERA_TANGENT), len(report_map.BEAM_TANGENT), len(report_map.PLANE_TANGENT))
+    index = observations.camera_index, observations.laser_index, observations.plane_index
+    counts = len(cell.cameras), len(cell.lasers), len(cell.planes)
+    out = np.zeros((*rows.shape[:2], int(np.dot(sizes, counts))))
+    begin = taken = 0
+    each = np.arange(len(rows))[:, None]
+    for size, which, count in zip(sizes, index, counts, strict=True):
+        at = begin + size * which[:, None] + np.arange(size)
+        out[each, :, at] = np.swapaxes(rows[..., taken : taken + size], 1, 2)
+        begin, taken = begin + size * count, taken + size
+    distances = begin - sizes[2] * counts[2] + 2 + sizes[2] * np.arange(counts[2])
+    out[..., distances] *= -1.0
+    return out
+
+
 def beam_frames(cell: Cell) -> dict[str, BeamFrame]:
     """The constant frame of each beam in a chart about ``cell``."""
     return {

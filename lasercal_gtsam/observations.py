@@ -17,6 +17,9 @@ from lasercal_gtsam.frozen import Array, FrozenData, set_array
 Names = npt.NDArray[np.str_]
 Index = npt.NDArray[np.int64]
 
+# hand poses of one stop are the same number, but for rounding on the way (m; elements of rotations)
+SAME_POSE = 1e-6
+
 
 @dataclass(frozen=True, eq=False)
 class Observations(FrozenData):
@@ -37,6 +40,12 @@ class Observations(FrozenData):
         Label of each spot.
     image_size : dict
         Camera name to (width, height), pixels.
+    stop : (N,) array of str, or None
+        Spots with the same label were seen while the hand stood still at one pose (by two cameras,
+        of two lasers, in several pictures), so that they share one error of the robot; "" for a
+        spot by itself. None: every spot has an error of its own, as when the hand was moved between
+        any two, also when it came back to the same pose. Matters where robot noise is stated or
+        estimated.
     """
 
     uv: Array
@@ -47,13 +56,16 @@ class Observations(FrozenData):
     plane: Names
     id: Names
     image_size: Mapping[str, tuple[int, int]]
+    stop: Names | None = None
 
     def __post_init__(self) -> None:
         n = len(set_array(self, "uv", self.uv, (None, 2)))
         check_pose(set_array(self, "T_base_hand", self.T_base_hand, (n, 4, 4)), "T_base_hand")
         cov = set_array(self, "cov_uv", self.cov_uv, (n, 2, 2), finite=False)
         _check_covariances(cov)
-        for name in ("camera", "laser", "plane", "id"):
+        for name in ("camera", "laser", "plane", "id", "stop"):
+            if name == "stop" and self.stop is None:
+                continue
             values = np.array(getattr(self, name), dtype=np.str_)
             if values.shape != (n,):
                 raise DataError(
@@ -66,6 +78,7 @@ class Observations(FrozenData):
         if missing:
             raise DataError(f"Observations.image_size: no size given for camera {missing[0]!r}")
         object.__setattr__(self, "image_size", sizes)
+        _check_stops(self)
 
     @classmethod
     def from_arrays(
@@ -80,6 +93,7 @@ class Observations(FrozenData):
         id: Iterable[Any] | None = None,
         sigma_px: float | npt.ArrayLike | None = None,
         cov_uv: npt.ArrayLike | None = None,
+        stop: Iterable[Any] | None = None,
     ) -> Observations:
         """Build from arrays; a single name stands for every spot.
 
@@ -92,12 +106,13 @@ class Observations(FrozenData):
         id : N labels; "0", "1", ... if left out
         sigma_px : one sigma, or N of them (px); not together with ``cov_uv``
         cov_uv : (N, 2, 2) or (2, 2), px^2
+        stop : N labels; the same for spots that were seen from one standing of the hand
 
         Raises
         ------
         DataError
             On wrong shapes, non-finite numbers, transforms that are not rigid, covariances that
-            are not positive definite.
+            are not positive definite, stops whose spots have different hand poses.
         """
         pixels = np.asarray(uv, dtype=np.float64)
         n = len(pixels) if pixels.ndim else 0
@@ -124,6 +139,7 @@ class Observations(FrozenData):
             plane=_names(plane, n),
             id=np.array([str(i) for i in (range(n) if id is None else id)], dtype=np.str_),
             image_size=image_size,
+            stop=None if stop is None else np.array([str(i) for i in stop], dtype=np.str_),
         )
 
     def __len__(self) -> int:
@@ -141,10 +157,14 @@ class Observations(FrozenData):
             plane=self.plane[rows],
             id=self.id[rows],
             image_size=self.image_size,
+            stop=None if self.stop is None else self.stop[rows],
         )
 
     def __add__(self, other: Observations) -> Observations:
-        """Both sets of spots, in order; the image sizes must agree."""
+        """Both sets of spots, in order; the image sizes must agree.
+
+        A stop of the same name is the same stop in both.
+        """
         for name in set(self.image_size) & set(other.image_size):
             if self.image_size[name] != other.image_size[name]:
                 raise DataError(
@@ -160,6 +180,7 @@ class Observations(FrozenData):
             plane=np.concatenate([self.plane, other.plane]),
             id=np.concatenate([self.id, other.id]),
             image_size={**self.image_size, **other.image_size},
+            stop=_joined_stops(self, other),
         )
 
     @cached_property
@@ -196,6 +217,18 @@ class Observations(FrozenData):
         """(N,) index of each spot's plane in `planes`."""
         return self._encoded["plane"][1]
 
+    @cached_property
+    def shared_stops(self) -> tuple[Index, ...]:
+        """Stops with several spots, by their number k: for each k > 1 (G, k) spots of G stops."""
+        if self.stop is None:
+            return ()
+        _, which, counts = np.unique(self.stop, return_inverse=True, return_counts=True)
+        order = np.argsort(which, kind="stable").astype(np.int64)
+        members = np.split(order, np.cumsum(counts)[:-1])
+        shared = [m for m in members if len(m) > 1 and self.stop[m[0]]]
+        sizes = sorted({len(m) for m in shared})
+        return tuple(np.array([m for m in shared if len(m) == k]) for k in sizes)
+
 
 def _names(value: str | Sequence[str], n: int) -> Names:
     return np.array([value] * n if isinstance(value, str) else value, dtype=np.str_)
@@ -213,6 +246,28 @@ def _encode(values: Names) -> tuple[tuple[str, ...], Index]:
     index = np.array([rank[str(x)] for x in unique], dtype=np.int64)[inverse]
     index.flags.writeable = False
     return tuple(names), index
+
+
+def _joined_stops(a: Observations, b: Observations) -> Names | None:
+    if a.stop is None and b.stop is None:
+        return None
+    parts = [np.full(len(x), "", dtype="<U1") if x.stop is None else x.stop for x in (a, b)]
+    return np.concatenate(parts)
+
+
+def _check_stops(observations: Observations) -> None:
+    """One standing of the hand is one pose."""
+    T = observations.T_base_hand
+    for members in observations.shared_stops:
+        apart = np.abs(T[members] - T[members[:, :1]]).max(axis=(1, 2, 3))
+        if np.any(apart > SAME_POSE):
+            first = members[int(np.argmax(apart > SAME_POSE))]
+            label, ids = str(observations.stop[first[0]]), observations.id[first].tolist()  # type: ignore[index]
+            raise DataError(
+                f"Observations.stop: the spots of stop {label!r} ({', '.join(ids)}) have hand "
+                f"poses that differ by up to {apart.max():.2g} (m, or elements of the rotation); a "
+                "stop is one standing of the hand: give its spots one pose, or labels of their own"
+            )
 
 
 def _check_covariances(cov: Array) -> None:

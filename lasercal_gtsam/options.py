@@ -11,6 +11,7 @@ from typing import Any, Literal, get_args
 from lasercal_gtsam.errors import DataError
 
 Robust = Literal["auto", "none", "huber", "cauchy", "geman-mcclure", "gnc-tls"]
+HAND_NOISE_NAMES = ("hand_sigma_m", "hand_sigma_rad")
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2")
 
 
@@ -25,6 +26,10 @@ class CalibrationOptions:
         residuals (a posteriori).
     hand_sigma_m, hand_sigma_rad
         Robot noise of a commanded hand pose, 1 sigma per axis (metres, radians).
+    estimate_noise
+        Which of these two nobody knows: ``"hand_sigma_m"``, ``"hand_sigma_rad"`` or both. They are
+        estimated from the residuals, together with the pixel sigma where ``sigma_px`` is None; what
+        is stated stays.
     robust
         What is done about outliers. ``"auto"``: looked for with a redescending loss, named and left
         out, then least squares; on clean data plain least squares to the last digit.
@@ -60,6 +65,7 @@ class CalibrationOptions:
     sigma_px: float | None = None
     hand_sigma_m: float = 0.0
     hand_sigma_rad: float = 0.0
+    estimate_noise: tuple[str, ...] = ()
     robust: Robust = "auto"
     distortion: str | tuple[str, ...] = "all"
     known: Mapping[str, Any] = field(default_factory=dict)
@@ -73,6 +79,7 @@ class CalibrationOptions:
         if self.robust not in get_args(Robust):
             allowed = ", ".join(get_args(Robust))
             problems.append(f"options.robust: expected one of {allowed}, got {self.robust!r}")
+        problems += _estimate_problems(self)
         if isinstance(self.fixed, str) or not all(isinstance(x, str) for x in self.fixed):
             problems.append(f"options.fixed: expected a tuple of names, got {self.fixed!r}")
         problems += [
@@ -83,8 +90,15 @@ class CalibrationOptions:
         if problems:
             raise DataError(*problems)
         object.__setattr__(self, "fixed", tuple(self.fixed))
+        wanted = tuple(name for name in HAND_NOISE_NAMES if name in self.estimate_noise)
+        object.__setattr__(self, "estimate_noise", wanted)
         if not isinstance(self.distortion, str):
             object.__setattr__(self, "distortion", tuple(self.distortion))
+
+    @property
+    def noisy_hand(self) -> bool:
+        """Whether the robot's noise is stated, or to be estimated."""
+        return self.hand_sigma_m > 0 or self.hand_sigma_rad > 0 or bool(self.estimate_noise)
 
 
 def _number_problems(options: CalibrationOptions) -> list[str]:
@@ -101,6 +115,21 @@ def _number_problems(options: CalibrationOptions) -> list[str]:
         f"options.{name}: expected {what}, got {getattr(options, name)!r}"
         for name, (good, what) in wanted.items()
         if not good
+    ]
+
+
+def _estimate_problems(options: CalibrationOptions) -> list[str]:
+    wanted = options.estimate_noise
+    good = isinstance(wanted, tuple | list) and all(x in HAND_NOISE_NAMES for x in wanted)
+    if not good:
+        allowed = " and ".join(map(repr, HAND_NOISE_NAMES))
+        hint = f"; a single name is written ({wanted!r},)" if isinstance(wanted, str) else ""
+        return [f"options.estimate_noise: expected a tuple out of {allowed}, got {wanted!r}{hint}"]
+    return [
+        f"options.estimate_noise: {name} is to be estimated, but also stated "
+        f"({getattr(options, name)!r}); leave one out"
+        for name in wanted
+        if getattr(options, name) != 0
     ]
 
 

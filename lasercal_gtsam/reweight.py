@@ -14,6 +14,7 @@ from typing import cast
 import numpy as np
 from lasercal_factors.batch import LossName, SpotBatch
 
+from lasercal_gtsam.calibration import with_levels
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
@@ -79,7 +80,7 @@ def refine_with_loss(search: Search, accepted: Accepted, name: str) -> Accepted:
         return accepted
     kept = _kept(accepted)
     loss = efficient_loss(cast(LossName, name))
-    spots_at = _spots_at(search, finished.sigma_px, ~kept)
+    spots_at = _spots_at(search, finished, ~kept)
     cell, holds = finished.solution.cell, finished.solution.problem.holds
     unknowns = int(finished.solution.problem.free.sum())
     iterations, change = finished.solution.iterations, np.inf
@@ -113,7 +114,8 @@ def refine_with_loss(search: Search, accepted: Accepted, name: str) -> Accepted:
     weights = np.where(possible, loss_weights(loss, np.where(possible, judged, 0.0) ** 2), 0.0)
     reasons = tuple(None if can else "no spot can be there" for can in possible)
     sigma_px = at_scale * (finished.sigma_px or 1.0)
-    return Accepted(Finished(answer, judged, sigma_px), reasons, accepted.start, weights)
+    weighed = finished._replace(solution=answer, lengths=judged, sigma_px=sigma_px)
+    return Accepted(weighed, reasons, accepted.start, weights)
 
 
 def refine_truncated(
@@ -159,7 +161,7 @@ def _graduated(search: Search, accepted: Accepted) -> Consensus | None:
     finished = accepted.finished
     problem = finished.solution.problem
     kept, unknowns = _kept(accepted), int(problem.free.sum())
-    spots_at = _spots_at(search, finished.sigma_px, ~kept)
+    spots_at = _spots_at(search, finished, ~kept)
     cell, iterations = finished.solution.cell, finished.solution.iterations
     quantile = rejection_length(len(kept))
     mu = 0.0
@@ -197,20 +199,19 @@ def _kept(accepted: Accepted) -> Mask:
     return np.array([reason is None for reason in accepted.reasons], dtype=np.bool_)
 
 
-def _spots_at(search: Search, sigma_px: float | None, rejected: Mask) -> SpotsAt:
+def _spots_at(search: Search, finished: Finished, rejected: Mask) -> SpotsAt:
     """Spots at a cell: as they were seen or, with a noisy robot, at corrected hand poses."""
-    options, observations = search.options, search.observations
-    if not (options.hand_sigma_m > 0 or options.hand_sigma_rad > 0):
+    options, observations = with_levels(search.options, finished.noise), search.observations
+    if not options.noisy_hand:
         return lambda cell: search.batch
-    noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
-    cov = pixel_covariances(observations, sigma_px or options.sigma_px)
+    noise = HandNoise.of(options)
+    cov = pixel_covariances(observations, finished.sigma_px or options.sigma_px)
     eta = np.zeros((len(observations), 6))
 
     def spots_at(cell: Cell) -> SpotBatch:
         nonlocal eta
         B, free_residual = linearized(observations, cell, eta)
-        eta = corrections(B, free_residual, cov, noise)
-        eta[rejected] = 0.0  # no hand pose explains an outlier
+        eta = corrections(B, free_residual, cov, noise, observations.shared_stops, rejected)
         return corrected_batch(observations, cov, cell, noise, eta)
 
     return spots_at

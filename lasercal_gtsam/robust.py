@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from lasercal_factors.batch import Loss, SpotBatch
 
+from lasercal_gtsam.calibration import NoiseLevel
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
@@ -49,12 +50,15 @@ class Finished(NamedTuple):
     """A solution, and how it judges the spots.
 
     ``lengths`` (N,): whitened residual length (sigmas) of every spot, those left out too; infinite
-    where no spot can be. ``sigma_px``: pixel sigma found on the way, if one was missing.
+    where no spot can be. ``sigma_px``: pixel sigma found on the way, if one was missing. ``noise``,
+    ``words``: noise levels that were to be estimated, and what must be said of them.
     """
 
     solution: Solution
     lengths: Array
     sigma_px: float | None = None
+    noise: tuple[NoiseLevel, ...] = ()
+    words: tuple[str, ...] = ()
 
 
 Finish = Callable[[Solution, Mask], Finished]

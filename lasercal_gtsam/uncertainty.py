@@ -136,7 +136,7 @@ def spot_leverages(problem: CellGraph, root: Array) -> Array:
     sizes = (len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT))
     lasers = sizes[0] * len(problem.start.cameras)
     planes = lasers + sizes[1] * len(problem.start.lasers)
-    out = np.zeros(len(batch))
+    parts = np.zeros((len(batch), 2, root.shape[1]))
     for c, l, p, first, last in batch.spots.blocks:  # noqa: E741
         at = np.concatenate(
             [
@@ -145,9 +145,8 @@ def spot_leverages(problem: CellGraph, root: Array) -> Array:
             ]
         )
         members = batch.order[first:last]
-        parts = rows[members, :, :-1].reshape(-1, len(at)) @ root[at]
-        out[members] = np.square(parts).sum(axis=1).reshape(-1, 2).sum(axis=1)
-    return out
+        parts[members] = rows[members, :, :-1] @ root[at]
+    return np.asarray(np.square(batch.decorrelated(parts)).sum(axis=(1, 2)))
 
 
 def table_parameters(cell: Cell, initial: Cell, uncertainty: Uncertainty) -> tuple[Parameter, ...]:

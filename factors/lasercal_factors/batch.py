@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from lasercal_factors import kernels
 from lasercal_factors.arrays import Array, Index, Spots, State
+from lasercal_factors.correlated import Correlation, Division, decorrelated
 from lasercal_factors.errors import FactorError
 
 LossName = Literal["none", "huber", "cauchy", "geman-mcclure"]
@@ -42,11 +43,13 @@ class SpotBatch:
     spots : arrays for the kernels
     order : (N,) input index of each spot held
     size : number of spots given (some may have been left out by `weighted`)
+    correlations : groups of spots whose errors are not independent
     """
 
     spots: Spots
     order: Index
     size: int
+    correlations: tuple[Correlation, ...] = ()
 
     @classmethod
     def from_arrays(
@@ -89,6 +92,35 @@ class SpotBatch:
         )
         return cls(spots, order, count)
 
+    def correlated(self, spots: npt.ArrayLike, cov: npt.ArrayLike) -> SpotBatch:
+        """The same with groups of spots that have errors in common.
+
+        Parameters
+        ----------
+        spots : (G, k) input indices; no spot in two groups
+        cov : (G, 2k, 2k) px^2, joint covariance of their pixels; each spot's own block is the
+            ``cov_uv`` that it was given
+
+        Raises
+        ------
+        FactorError
+            On shapes that do not fit, a spot twice, or a spot that was left out.
+        """
+        groups = np.asarray(spots, dtype=np.int64)
+        joint = np.asarray(cov, dtype=np.float64)
+        if groups.ndim != 2 or joint.shape != (len(groups), *(2 * groups.shape[1],) * 2):
+            raise FactorError(
+                f"correlated spots: groups {groups.shape}, covariances {joint.shape}; expected "
+                "(G, k) and (G, 2k, 2k)"
+            )
+        named = np.concatenate([groups.ravel(), *(c.spots.ravel() for c in self.correlations)])
+        if len(np.unique(named)) != len(named) or not self.used[named].all():
+            raise FactorError("correlated spots: one is in two groups, or was left out")
+        whitening = np.zeros((self.size, 3))
+        whitening[self.order] = self.spots.pixels[2:].T
+        found = Correlation.of(groups, joint, whitening)
+        return replace(self, correlations=(*self.correlations, found))
+
     def __len__(self) -> int:
         return self.size
 
@@ -109,13 +141,28 @@ class SpotBatch:
         pixels = self.spots.pixels[:, keep]
         pixels[2:] *= np.sqrt(weight[keep])
         spots = Spots(pixels, np.ascontiguousarray(self.spots.hands[:, keep]), _blocks(who[keep]))
-        return SpotBatch(spots, self.order[keep], self.size)
+        correlations = tuple(c.weighted(given) for c in self.correlations)
+        return SpotBatch(spots, self.order[keep], self.size, correlations)
 
     def scaled(self, scale: float) -> SpotBatch:
         """Return the same spots with every pixel sigma multiplied by ``scale``."""
         pixels = self.spots.pixels.copy()
         pixels[2:] /= scale
-        return SpotBatch(self.spots._replace(pixels=pixels), self.order, self.size)
+        return replace(self, spots=self.spots._replace(pixels=pixels))
+
+    @cached_property
+    def division(self) -> Division:
+        """The spots in two parts: by themselves, and correlated ones."""
+        return Division.of(self)
+
+    def decorrelated(self, rows: Array) -> Array:
+        """Whitened rows (N, 2, m) in input order, those of correlated spots made independent.
+
+        Rows of spots left out are zero then.
+        """
+        if not self.correlations:
+            return rows
+        return decorrelated(np.where(self.used[:, None, None], rows, 0.0), self.correlations)
 
     @cached_property
     def used(self) -> npt.NDArray[np.bool_]:
@@ -131,7 +178,10 @@ class SpotBatch:
         return out
 
     def whitened_lengths(self, state: State) -> Array:
-        """Length of each whitened residual (sigmas), input order, (N,); NaN as in `residuals`."""
+        """Length of each whitened residual (sigmas), input order, (N,); NaN as in `residuals`.
+
+        Each spot by itself, whatever it has in common with others.
+        """
         du, dv = kernels.residuals(self.spots, state).T
         w00, w01, w11 = self.spots.pixels[2:]
         out = np.full(self.size, np.nan)
@@ -139,14 +189,28 @@ class SpotBatch:
         return out
 
     def rows(self, state: State) -> Array:
-        """Whitened Jacobian and residual of each spot in input order, (N, 2, 23)."""
+        """Whitened Jacobian and residual of each spot in input order, (N, 2, 23).
+
+        Each spot by itself; `decorrelated` makes correlated ones independent.
+        """
         out = np.full((self.size, 2, kernels.COLUMNS), np.nan)
         out[self.order] = kernels.rows(self.spots, state)
         return out
 
     def total_loss(self, state: State, loss: Loss) -> float:
         """Sum of the losses (twice the graph's error); inf where a spot cannot be."""
+        if self.correlations:
+            refuse_loss(loss)
+            return self.division.total_loss(state)
         return float(kernels.total_loss(self.spots, state, LOSSES[loss.name], loss.threshold))
+
+
+def refuse_loss(loss: Loss) -> None:
+    """Raise `FactorError` where correlated spots are to be weighed one by one."""
+    if loss.name != "none":
+        raise FactorError(
+            f"the {loss.name} loss weighs spots one by one; correlated spots have no such weight"
+        )
 
 
 def _blocks(who: Index) -> Index:

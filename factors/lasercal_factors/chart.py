@@ -17,11 +17,11 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from lasercal_factors import chart_kernels
-from lasercal_factors.arrays import Array, State
-from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch
+from lasercal_factors import chart_kernels, kernels
+from lasercal_factors.arrays import Array, Index, State
+from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch, refuse_loss
 from lasercal_factors.errors import FactorError
-from lasercal_factors.wrap import custom_factor
+from lasercal_factors.wrap import Error, Linearize, custom_factor
 
 CAMERA_DIM, BEAM_DIM, PLANE_DIM = 15, 4, 3
 
@@ -122,6 +122,11 @@ def LaserCellFactor(
     about = (chart.aspect_array, reference, batch.spots)
     robust = (LOSSES[loss.name], loss.threshold)
     constraints = (mask, tie_from, tie_from + 1, chart.aspect_array[tied])
+    noise = gtsam.noiseModel.Unit.Create(n + 1)
+    if batch.correlations:
+        refuse_loss(loss)
+        functions = _correlated(key, chart, batch, offsets, constraints)
+        return custom_factor("LaserCellFactor", noise, [key], [n], *functions)
 
     def error(values: Any) -> Array:
         e = np.zeros(n + 1)
@@ -135,5 +140,30 @@ def LaserCellFactor(
             raise FactorError("LaserCellFactor: " + IMPOSSIBLE)
         return R[:, n], [R[:, :n]]
 
-    noise = gtsam.noiseModel.Unit.Create(n + 1)
     return custom_factor("LaserCellFactor", noise, [key], [n], error, linearize)
+
+
+def _correlated(
+    key: int, chart: CellChart, batch: SpotBatch, offsets: Index, constraints: tuple[Any, ...]
+) -> tuple[Error, Linearize]:
+    """Error and derivative of `LaserCellFactor` where some spots have errors in common."""
+    division, reference, n = batch.division, chart.reference, chart.n
+
+    def error(values: Any) -> Array:
+        e = np.zeros(n + 1)
+        e[0] = math.sqrt(division.total_loss(chart.state(values.atVector(key))))
+        return e
+
+    def linearize(values: Any) -> tuple[Array, list[Array]]:
+        z = values.atVector(key)
+        state = chart.state(z)
+        H = division.information(offsets, n, state)
+        if not math.isfinite(H[0, 0]):
+            raise FactorError("LaserCellFactor: " + IMPOSSIBLE)
+        parts = len(state.cam_R), len(state.beam_l)
+        chart_kernels.transport(H, z, reference.plane_n, state.plane_n, *parts)
+        kernels.constrain(H, *constraints)
+        R = kernels.cholesky(H)
+        return R[:, n], [R[:, :n]]
+
+    return error, linearize

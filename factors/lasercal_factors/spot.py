@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from lasercal_factors import kernels
 from lasercal_factors.arrays import Array, Index, State
-from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch
+from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch, refuse_loss
 from lasercal_factors.beam import BeamFrame
 from lasercal_factors.errors import FactorError
 from lasercal_factors.wrap import custom_factor
@@ -191,6 +191,8 @@ def LaserSpotBatchFactor(
     mask = np.zeros(n, np.bool_) if held is None else np.array(held, np.bool_)
     if mask.shape != (n,):
         raise FactorError(f"held: expected ({n},) booleans, got {mask.shape}")
+    if batch.correlations:
+        refuse_loss(loss)
     none = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
     spots, offsets = batch.spots, keys.offsets(batch)
     rest = (LOSSES[loss.name], loss.threshold, (mask, *none))
@@ -202,8 +204,17 @@ def LaserSpotBatchFactor(
         e[0] = math.sqrt(batch.total_loss(keys.read(values), loss))
         return e
 
+    def root(state: State) -> Array:
+        if not batch.correlations:
+            return kernels.square_root_information(spots, offsets, n, state, *rest)  # type: ignore[no-any-return]
+        H = batch.division.information(offsets, n, state)
+        if not math.isfinite(H[0, 0]):
+            return H
+        kernels.constrain(H, *rest[2])
+        return kernels.cholesky(H)  # type: ignore[no-any-return]
+
     def linearize(values: Any) -> tuple[Array, list[Array]]:
-        R = kernels.square_root_information(spots, offsets, n, keys.read(values), *rest)
+        R = root(keys.read(values))
         if not math.isfinite(R[0, 0]):
             raise FactorError("LaserSpotBatchFactor: " + IMPOSSIBLE)
         return R[:, n], [R[:, c] for c in columns]
