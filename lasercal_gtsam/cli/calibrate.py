@@ -75,7 +75,7 @@ CALIBRATION_FILE = "calibration.json"
 @click.option(
     "--sigma-px",
     metavar="X",
-    type=click.FloatRange(min=0, min_open=True),
+    type=click.FloatRange(min=1e-9, max=1e6),
     help="Sigma of pixels that have none of their own; wins over capture.yaml.",
 )
 @click.option(

@@ -20,7 +20,9 @@ from lasercal_gtsam.cli.check import check
 from lasercal_gtsam.cli.check_sigma import check_sigma
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
+from lasercal_gtsam.cli.export import export
 from lasercal_gtsam.cli.history import history
+from lasercal_gtsam.cli.importing import import_recording
 from lasercal_gtsam.cli.judge import judge
 from lasercal_gtsam.cli.simulate import simulate
 from lasercal_gtsam.cli.update import update
@@ -51,10 +53,12 @@ for _command in (
     check,
     check_sigma,
     judge,
+    import_recording,
     detect,
     update,
     watch,
     history,
+    export,
     simulate,
     demo,
 ):
@@ -78,13 +82,20 @@ def main(args: Sequence[str] | None = None) -> int:
         click.echo("Interrupted: nothing was saved half written.", err=True)
         return INTERRUPTED
     except LasercalError as error:
-        for line in str(error).splitlines():
-            click.echo(f"Error: {line}", err=True)
+        for line in str(error).split("\n"):
+            click.echo(f"Error: {_visible(line)}", err=True)
         return FAILED
     except OSError as error:  # a full disk, a terminal that is gone
         click.echo(f"Error: {error}", err=True)
         return FAILED
     return status if isinstance(status, int) else 0
+
+
+def _visible(text: str) -> str:
+    """Text with escapes for what a terminal would obey instead of show."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _expect_a_short_life() -> None:

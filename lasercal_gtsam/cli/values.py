@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 else:  # no generic class before click 8.2
     _ParamType = click.ParamType
 
+_LARGEST_NUMBER = 1e9  # of what is known of a camera, in any unit
+
 Number = float | tuple[float, ...]
 
 
@@ -36,7 +38,7 @@ class Assignment(_ParamType):
             numbers = tuple(float(part) for part in text.split(","))
         except ValueError:
             numbers = (math.nan,)
-        if not all(map(math.isfinite, numbers)):
+        if not all(abs(number) <= _LARGEST_NUMBER for number in numbers):  # nor NaN
             self.fail(
                 f"{value!r}: expected a number, or several separated by commas, behind '='",
                 param,

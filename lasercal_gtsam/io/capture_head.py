@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, field_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationError, field_validator
 
 from lasercal_gtsam.cell import INTRINSIC_NAMES
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.conventions import ROTATION_CHOICES, rotation_format
 from lasercal_gtsam.io.schema import Location, Strict, dotted, validation_problems
-from lasercal_gtsam.io.wording import at_most, did_you_mean
+from lasercal_gtsam.io.wording import at_most, cannot_be_a_name, did_you_mean, quoted
 from lasercal_gtsam.io.yaml_text import Lines, read_yaml
 
 KNOWN_NAMES = ("principal_point", "aspect", *INTRINSIC_NAMES)
@@ -24,17 +24,33 @@ def _name(value: Any) -> Any:
     return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
-Name = Annotated[str, BeforeValidator(_name), Field(min_length=1)]
-FileName = Annotated[str, Field(min_length=1)]
-Pixels = Annotated[int, Field(gt=0)]
+def _visible(name: str) -> str:
+    if (odd := cannot_be_a_name(name)) is not None:
+        raise ValueError(odd)
+    return name
+
+
+def _sigma(value: float) -> float:
+    """Sigmas are squared and divided by: 0, or a number for which both can be done."""
+    if value and not SMALLEST_SIGMA <= value <= LARGEST_SIGMA:
+        raise ValueError(f"expected 0, or {SMALLEST_SIGMA:g} to {LARGEST_SIGMA:g}; got {value:g}")
+    return value
+
+
+SMALLEST_SIGMA, LARGEST_SIGMA, LARGEST_KNOWN = 1e-9, 1e6, 1e9
+
+Name = Annotated[str, BeforeValidator(_name), AfterValidator(_visible), Field(min_length=1)]
+FileName = Annotated[str, AfterValidator(_visible), Field(min_length=1)]
+Pixels = Annotated[int, Field(gt=0, le=65535)]
+Sigma = Annotated[float, Field(ge=0), AfterValidator(_sigma)]
 
 
 class CameraHead(Strict):
     """One camera."""
 
     name: Name = Field("camera", description="the camera's name")
-    width: Pixels = Field(description="the picture's width in pixels, a whole number")
-    height: Pixels = Field(description="the picture's height in pixels, a whole number")
+    width: Pixels = Field(description="the picture's width in pixels, a whole number up to 65535")
+    height: Pixels = Field(description="the picture's height in pixels, a whole number up to 65535")
 
 
 class PosesHead(Strict):
@@ -82,12 +98,12 @@ class ImagesHead(Strict):
 class NoiseHead(Strict):
     """What the user knows about the noise, 1 sigma."""
 
-    pixel: float | None = Field(None, ge=0, description="the pixel sigma, 0 or more")
-    hand_translation_mm: float = Field(
-        0.0, ge=0, description="the sigma of the hand's position per axis in mm, 0 or more"
+    pixel: Sigma | None = Field(None, description="the pixel sigma, 0 or more")
+    hand_translation_mm: Sigma = Field(
+        0.0, description="the sigma of the hand's position per axis in mm, 0 or more"
     )
-    hand_rotation_deg: float = Field(
-        0.0, ge=0, description="the sigma of the hand's rotation per axis in degrees, 0 or more"
+    hand_rotation_deg: Sigma = Field(
+        0.0, description="the sigma of the hand's rotation per axis in degrees, 0 or more"
     )
 
 
@@ -196,7 +212,7 @@ def _known_problems(known: Mapping[Any, Any], cameras: list[str]) -> list[tuple[
         camera, _, name = str(key).rpartition(".")
         if camera and camera not in cameras:
             problems.append(
-                ((key,), f"there is no camera {camera!r}{did_you_mean(camera, cameras)}")
+                ((key,), f"there is no camera {quoted(camera)}{did_you_mean(camera, cameras)}")
             )
         if name not in KNOWN_NAMES:
             problems.append(
@@ -207,19 +223,30 @@ def _known_problems(known: Mapping[Any, Any], cameras: list[str]) -> list[tuple[
                 )
             )
         elif name == "principal_point":
-            if not (isinstance(value, list) and len(value) == 2 and all(map(_finite, value))):
-                problems.append(((key,), f"expected [u0, v0] in pixels, got {value!r}"))
+            if not (isinstance(value, list) and len(value) == 2 and all(map(_pixel, value))):
+                problems.append(((key,), f"expected [u0, v0] in pixels, got {value!r:.60}"))
             problems += [
                 ((key,), f"{axis} is given here and on its own")
                 for axis in ("u0", "v0")
                 if f"{camera}.{axis}".lstrip(".") in known
             ]
+        elif _finite(value) and abs(value) > LARGEST_KNOWN:
+            problems.append(((key,), f"expected at most {LARGEST_KNOWN:g}, got {value!r:.60}"))
         elif not _finite(value):
-            problems.append(((key,), f"expected a number, got {value!r}"))
+            problems.append(((key,), f"expected a number, got {value!r:.60}"))
         elif name in ("aspect", "fu", "fv") and value <= 0:
             problems.append(((key,), f"expected a number above 0, got {value!r}"))
     return problems
 
 
+def _pixel(value: Any) -> bool:
+    return _finite(value) and abs(value) <= LARGEST_KNOWN
+
+
 def _finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    # a whole number may be too long for math.isfinite
+    return (
+        isinstance(value, int | float)
+        and not isinstance(value, bool)
+        and (isinstance(value, int) or math.isfinite(value))
+    )

@@ -19,7 +19,7 @@ from lasercal_gtsam.io.conventions import (
     rounding_of_rotations,
 )
 from lasercal_gtsam.io.tables import Table, read_table
-from lasercal_gtsam.io.wording import did_you_mean, some
+from lasercal_gtsam.io.wording import did_you_mean, quoted, some
 from lasercal_gtsam.units import MM_PER_M
 
 DEFAULT_LASER = "laser"
@@ -31,6 +31,9 @@ ROUNDING_WORTH_A_WARNING = 2e-6
 # Hand positions beyond these are rather a wrong unit than a robot.
 LARGEST_PLAUSIBLE_M, SMALLEST_PLAUSIBLE_M = 50.0, 0.01
 LARGEST_PLAUSIBLE_RAD = 4 * np.pi
+# No length, angle or pixel in any unit is larger; squares of such numbers can be added safely.
+LARGEST_NUMBER = 1e9
+SMALLEST_SIGMA_PX, LARGEST_CORRELATION = 1e-9, 1 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -136,8 +139,8 @@ def _check_names(table: Table, column: str, found: list[str], allowed: list[str]
         if name and name not in allowed:
             table.add_problem(
                 row,
-                f"{column}: unknown {column} {name!r}{did_you_mean(name, allowed)}; capture.yaml "
-                f"has {some(allowed)}",
+                f"{column}: unknown {column} {quoted(name)}{did_you_mean(name, allowed)}; "
+                f"capture.yaml has {some(allowed)}",
             )
 
 
@@ -151,11 +154,11 @@ def _poses(table: Table, head: CaptureHead, warnings: list[str]) -> Array:
     has_position = table.require(["x", "y", "z"], "the position of the hand")
     has_rotation = table.require(fmt.columns, f"needed by rotation {fmt.name}")
     if has_position:
-        position = table.numbers(["x", "y", "z"])
+        position = table.numbers(["x", "y", "z"], largest=LARGEST_NUMBER)
         T[:, :3, 3] = position / MM_PER_M if head.poses.length == "mm" else position
         warnings += _length_warnings(T[:, :3, 3], head, table.name)
     if has_rotation:
-        values = table.numbers(fmt.columns)
+        values = table.numbers(fmt.columns, largest=LARGEST_NUMBER)
         good = _complete(values)
         for row, text in rotation_problems(fmt.name, values):
             if good[row]:
@@ -213,7 +216,7 @@ def spot_pixels(table: Table, sizes: Sequence[tuple[int, int] | None]) -> tuple[
         return uv, cov
     if not table.require(["u", "v"], "a spot needs both"):
         return uv, cov
-    uv = table.numbers(["u", "v"], allow_empty=True)
+    uv = table.numbers(["u", "v"], allow_empty=True, largest=LARGEST_NUMBER)
     for row, size in enumerate(sizes):
         u, v = (table.columns[name][row] for name in ("u", "v"))
         if bool(u) != bool(v):
@@ -246,7 +249,7 @@ def _covariances(table: Table) -> Array:
         return cov
     if not table.require(["sigma_u", "sigma_v"], "a covariance needs both"):
         return cov
-    sigma = table.numbers(["sigma_u", "sigma_v"], allow_empty=True)
+    sigma = table.numbers(["sigma_u", "sigma_v"], allow_empty=True, largest=LARGEST_NUMBER)
     rho = np.zeros(len(table))
     if "rho_uv" in table.columns:
         rho = table.numbers(["rho_uv"], allow_empty=True)[:, 0]
@@ -258,9 +261,10 @@ def _covariances(table: Table) -> Array:
             table.add_problem(row, "sigma_u, sigma_v: one is empty; give both or none")
         elif not table.columns["u"][row]:
             table.add_problem(row, "sigma_u, sigma_v: given without a pixel u, v")
-        elif (sigma[row] <= 0).any():
-            table.add_problem(row, f"sigma_u, sigma_v: expected numbers above 0, got {cells}")
-        elif abs(rho[row]) >= 1:
+        elif (sigma[row] < SMALLEST_SIGMA_PX).any():
+            few = f"expected numbers above 0 (at least {SMALLEST_SIGMA_PX:g}), got {cells}"
+            table.add_problem(row, f"sigma_u, sigma_v: {few}")
+        elif abs(rho[row]) > LARGEST_CORRELATION:
             table.add_problem(row, f"rho_uv: expected a correlation in (-1, 1), got {rho[row]:g}")
         else:
             su, sv = sigma[row]
@@ -290,7 +294,7 @@ def _merge_spots(
     for row, name in enumerate(found):
         if name not in row_of:
             if poses.whole:
-                table.add_problem(row, f"id: {name!r} is not in {poses.name}")
+                table.add_problem(row, f"id: {quoted(name)} is not in {poses.name}")
             continue
         target = row_of[name]
         empty = not (table.columns["u"][row] or table.columns["v"][row])

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import re
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from lasercal_gtsam.errors import DataError
+
+# JSON can name one half of a surrogate pair alone, which no file can hold
+_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def read_text(path: str | Path) -> str:
@@ -42,18 +49,47 @@ def read_json(path: Path) -> Any:
     if not text.strip():
         raise DataError(f"{path}: the file is empty")
     try:
-        return json.loads(text)
+        return checked_text(json.loads(text), text)
     except json.JSONDecodeError as error:
         raise DataError(f"{path}:{error.lineno}:{error.colno}: not JSON: {error.msg}") from None
+    except (RecursionError, ValueError) as error:  # thousands of brackets, or of digits
+        raise DataError(f"{path}: JSON that cannot be taken: {error}") from None
+
+
+def checked_text(data: Any, text: str) -> Any:
+    """What JSON text says; ValueError where an escape in it stands for half a character."""
+    if _HALF.search(text):
+        json.dumps(data, ensure_ascii=False).encode()
+    return data
 
 
 def read_bytes(path: str | Path) -> bytes:
-    """Content of a file; `DataError` if it is missing, a folder or may not be read."""
+    """Content of a file.
+
+    Raises
+    ------
+    DataError
+        The file is missing, is a folder, may not be read, or is none that has an end (a pipe that
+        nobody writes to would be waited for for ever).
+    """
     path = Path(path)
     try:
+        check_regular(path)
         return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path}: {reason_of(error)}") from None
+
+
+def check_regular(path: Path) -> None:
+    """Raise `OSError` where a path is no regular file; links are followed."""
+    try:
+        mode = path.stat().st_mode
+    except ValueError:  # Python's own refusal of a name
+        raise OSError(errno.EINVAL, "a file's name cannot hold a NUL character") from None
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError
+    if not stat.S_ISREG(mode):
+        raise OSError(errno.EINVAL, "this is a pipe or a device, expected a file")
 
 
 def sha256_of(path: str | Path) -> str:
@@ -86,11 +122,9 @@ def replacing(path: str | Path) -> Iterator[Path]:
     link is followed, and the mode of an existing file is kept.
     """
     path = Path(path)
-    target = path.resolve()
     temporary: Path | None = None
     try:
-        if target.is_dir():
-            raise IsADirectoryError
+        target = _resolved(path)
         temporary = _new_file_beside(target)
         yield temporary
         if target.exists():
@@ -105,6 +139,40 @@ def replacing(path: str | Path) -> Iterator[Path]:
         if temporary is not None:
             with suppress(OSError):
                 temporary.unlink()
+
+
+def _resolved(path: Path) -> Path:
+    """Where a file is put: what is there already is a regular file."""
+    with suppress(FileNotFoundError):
+        check_regular(path)
+    return path.resolve()
+
+
+@contextmanager
+def whole_folder(folder: str | Path, last: str) -> Iterator[Path]:
+    """Give an empty folder whose content, on leaving without an error, appears in ``folder``.
+
+    Parameters
+    ----------
+    folder : a new or empty folder; made if it is not there
+    last : name of the file that appears last, and so tells that all is there
+
+    Raises
+    ------
+    DataError
+        ``folder`` is not empty or cannot be written to.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise DataError(f"{folder}: the folder is not empty; give a new one")
+        with TemporaryDirectory(prefix=".writing-", dir=folder) as staging:
+            yield Path(staging)
+            for path in sorted(Path(staging).iterdir(), key=lambda path: path.name == last):
+                path.rename(folder / path.name)
+    except OSError as error:
+        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
 
 
 def _new_file_beside(target: Path) -> Path:

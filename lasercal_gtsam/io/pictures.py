@@ -10,13 +10,17 @@ from typing import Any
 import numpy.typing as npt
 
 from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.io.decoders import decoder_complaints, is_damage
 from lasercal_gtsam.io.files import read_bytes
+from lasercal_gtsam.io.picture_header import FORMATS, read_picture_header
 from lasercal_gtsam.io.wording import at_most, did_you_mean
 
 Picture = npt.NDArray[Any]
 OptionalPaths = tuple[Path | None, ...]
 
 PLACEHOLDERS = ("id", "plane", "camera", "laser")
+# The largest sensors have 151 million; each million takes 0.1 s and 55 MB.
+MAX_PIXELS = 160_000_000
 _GLOB = re.compile(r"[*?\[]")
 
 
@@ -42,20 +46,57 @@ def read_picture(path: Path, size: tuple[int, int], where: str) -> Picture:
     if not path.is_file():
         raise DataError(f"{where}: the picture {path} is missing")
     content = read_bytes(path)
-    picture = _decode(content) if content and not _cut_off(content) else None
+    header = read_picture_header(content)
+    if header is not None and (header.width, header.height) != size:
+        raise DataError(
+            f"{where}: the picture {path} is {header.width} x {header.height} pixels, but its "
+            f"camera has {size[0]} x {size[1]}"
+        )
+    picture, fault = decode_picture(content)
     if picture is None:
-        fault = "empty" if not content else "cut off" if _cut_off(content) else "damaged or unknown"
         raise DataError(
             f"{where}: {path} is not a picture that can be read (the file is {fault}); expected "
-            "PNG, TIFF, BMP, PGM or JPEG"
-        )
-    height, width = picture.shape[:2]
-    if (width, height) != size:
-        raise DataError(
-            f"{where}: the picture {path} is {width} x {height} pixels, but its camera has "
-            f"{size[0]} x {size[1]}"
+            f"{FORMATS}"
         )
     return picture
+
+
+def decode_picture(content: bytes) -> tuple[Picture | None, str]:
+    """The picture in a file's content as it was saved; or None and what is wrong with it.
+
+    A damaged file is not taken, though a decoder may make a picture of it.
+    """
+    if not content:
+        return None, "empty"
+    header = read_picture_header(content)
+    if header is None:
+        return None, "damaged or unknown"
+    if header.cmyk:
+        return None, "in CMYK, the colours of a printer, where gray or RGB is needed"
+    if header.width * header.height > MAX_PIXELS:
+        return None, (
+            f"of {header.width} x {header.height} pixels, more than {MAX_PIXELS / 1e6:.0f} million"
+        )
+    if _cut_off(content):
+        return None, "cut off"
+    with decoder_complaints() as complaints:
+        picture = _decode(content)
+    if picture is None:
+        return None, "damaged or unknown"
+    if picture.shape[:2] != (header.height, header.width):
+        return None, "damaged: its pixels are not as many as its header says"
+    damage = next(filter(is_damage, complaints), None)
+    return (None, f"damaged: {damage}") if damage else (picture, "")
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write a picture as PNG, which keeps every pixel; colour is BGR."""
+    import cv2
+
+    encoded, content = cv2.imencode(".png", picture)
+    if not encoded:
+        raise DataError(f"{path}: the picture could not be encoded as PNG")
+    path.write_bytes(content.tobytes())
 
 
 def _decode(content: bytes) -> Picture | None:
@@ -68,6 +109,8 @@ def _decode(content: bytes) -> Picture | None:
     log.setLogLevel(log.LOG_LEVEL_SILENT)
     try:
         return cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:  # sizes that no memory holds
+        return None
     finally:
         log.setLogLevel(level)
 

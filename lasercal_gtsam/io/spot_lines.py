@@ -22,8 +22,11 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.capture_head import PosesHead
 from lasercal_gtsam.io.capture_rows import (
     DEFAULT_LASER,
+    LARGEST_CORRELATION,
+    LARGEST_NUMBER,
     LARGEST_PLAUSIBLE_M,
     OUTSIDE_TOLERANCE_PX,
+    SMALLEST_SIGMA_PX,
     inverse_poses,
 )
 from lasercal_gtsam.io.conventions import (
@@ -31,7 +34,7 @@ from lasercal_gtsam.io.conventions import (
     rotation_problems,
     rotations_from_columns,
 )
-from lasercal_gtsam.io.wording import did_you_mean, some
+from lasercal_gtsam.io.wording import cannot_be_a_name, did_you_mean, quoted, some
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.rotations import make_pose
 from lasercal_gtsam.units import MM_PER_M
@@ -134,7 +137,9 @@ class SpotLines:
         unknown = [key for key in data if key not in self._keys]
         if unknown:
             near = did_you_mean(unknown[0], self._keys)
-            raise DataError(f"unknown key {unknown[0]!r}{near}; allowed are {some(self._keys, 30)}")
+            raise DataError(
+                f"unknown key {quoted(unknown[0])}{near}; allowed are {some(self._keys, 30)}"
+            )
         camera = self._camera(data)
         return Observations(
             uv=self._pixel(data, self.image_size[camera])[None],
@@ -166,8 +171,8 @@ class SpotLines:
         plane = _name("plane", data)
         if self._planes is not None and plane not in self._planes:
             raise DataError(
-                f"plane: unknown plane {plane!r}{did_you_mean(plane, self._planes)}; capture.yaml "
-                f"has {some(list(self._planes))}"
+                f"plane: unknown plane {quoted(plane)}{did_you_mean(plane, self._planes)}; "
+                f"capture.yaml has {some(list(self._planes))}"
             )
         return plane
 
@@ -186,8 +191,12 @@ class SpotLines:
             raise DataError("sigma_px, cov_uv: give one of them")
         if "cov_uv" in data:
             cov = _numbers("cov_uv", data, (2, 2), "[[uu, uv], [uv, vv]] in px^2")
+            least, product = np.diag(cov).min(), float(cov[0, 0] * cov[1, 1])
             symmetric = abs(cov[0, 1] - cov[1, 0]) <= 1e-9 * (cov[0, 0] + cov[1, 1])
-            if not (symmetric and cov[0, 0] > 0 and np.linalg.det(cov) > 0):
+            apart = least >= SMALLEST_SIGMA_PX**2 and (
+                abs(cov[0, 1]) <= LARGEST_CORRELATION * math.sqrt(product)
+            )
+            if not (symmetric and apart):
                 raise DataError(
                     f"cov_uv: expected a symmetric, positive definite matrix, got {cov.tolist()}"
                 )
@@ -195,8 +204,9 @@ class SpotLines:
         sigma = self._sigma_px
         if "sigma_px" in data:
             sigma = float(_numbers("sigma_px", data, (), "a number above 0"))
-            if sigma <= 0:
-                raise DataError(f"sigma_px: expected a number above 0, got {sigma:g}")
+            if sigma < SMALLEST_SIGMA_PX:
+                least = f"above 0 (at least {SMALLEST_SIGMA_PX:g})"
+                raise DataError(f"sigma_px: expected a number {least}, got {sigma:g}")
         return np.full((2, 2), np.nan) if sigma is None else sigma**2 * np.eye(2)
 
     def _pose(self, data: Mapping[str, Any]) -> Array:
@@ -246,6 +256,8 @@ def _object(line: bytes) -> dict[str, Any]:
         raise LineError(f"column {error.colno}: not JSON: {error.msg}") from None
     except RecursionError:
         raise LineError("not JSON: nested too deeply") from None
+    except ValueError:  # Python's limit of digits
+        raise LineError("a whole number with thousands of digits") from None
     if not isinstance(data, dict):
         raise LineError(f"expected an object {{...}}, got {_shown(data)}")
     return data
@@ -257,7 +269,9 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         keys = [key for key, _ in pairs]
         twice = next(key for key in keys if keys.count(key) > 1)
         label = data.get("id")
-        raise LineError(f"the key {twice!r} is there twice", None if label is None else str(label))
+        raise LineError(
+            f"the key {quoted(twice)} is there twice", None if label is None else str(label)
+        )
     return data
 
 
@@ -280,6 +294,8 @@ def _name(key: str, data: Mapping[str, Any]) -> str:
     if not isinstance(value, str) or not value.strip():
         found = _shown(value) if key in data else "nothing"
         raise DataError(f"{key}: expected a name, got {found}")
+    if (odd := cannot_be_a_name(value.strip())) is not None:
+        raise DataError(f"{key}: {odd}")
     return value.strip()
 
 
@@ -292,7 +308,7 @@ def _only(key: str, data: Mapping[str, Any], names: tuple[str, ...], others: boo
     name = _name(key, data)
     if name not in names and not others:
         near = did_you_mean(name, names)
-        raise DataError(f"{key}: unknown {key} {name!r}{near}; there are {some(list(names))}")
+        raise DataError(f"{key}: unknown {key} {quoted(name)}{near}; there are {some(list(names))}")
     return name
 
 
@@ -310,7 +326,7 @@ def _collect(value: Any, shape: tuple[int, ...], into: list[float]) -> bool:
     if not shape:
         if isinstance(value, bool) or not isinstance(value, int | float):
             return False
-        into.append(float(value) if abs(value) < 1e300 else math.inf)
+        into.append(float(value) if abs(value) <= LARGEST_NUMBER else math.inf)
         return True
     if not isinstance(value, list) or len(value) != shape[0]:
         return False

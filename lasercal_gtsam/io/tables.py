@@ -15,7 +15,7 @@ import numpy as np
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.files import read_text
-from lasercal_gtsam.io.wording import at_most, nearest, some
+from lasercal_gtsam.io.wording import at_most, cannot_be_a_name, nearest, quoted, some
 
 Row = tuple[int, list[str]]
 
@@ -82,7 +82,7 @@ class Table:
             ]
             self.add_file_problem(
                 f"column{'s' if len(missing) > 1 else ''} {', '.join(missing)} missing, {why}; the "
-                f"file has {', '.join(self.columns)}{''.join(' (' + g + ')' for g in guesses)}"
+                f"file has {some(list(self.columns), 30)}{''.join(' (' + g + ')' for g in guesses)}"
             )
         return not missing
 
@@ -92,6 +92,8 @@ class Table:
         for row, cell in enumerate(cells):
             if not cell:
                 self.add_problem(row, f"{name}: empty, expected a name")
+            elif (odd := cannot_be_a_name(cell)) is not None:
+                self.add_problem(row, f"{name}: {odd}")
         return cells
 
     def unique(self, name: str) -> list[str]:
@@ -100,24 +102,25 @@ class Table:
         first: dict[str, int] = {}
         for row, cell in enumerate(cells):
             if cell and cell in first:
-                self.add_problem(
-                    row,
-                    f"{name}: duplicate {cell!r}, already used in line {self.lines[first[cell]]}",
-                )
+                earlier = f"already used in line {self.lines[first[cell]]}"
+                self.add_problem(row, f"{name}: duplicate {quoted(cell)}, {earlier}")
             first.setdefault(cell, row)
         return cells
 
-    def numbers(self, names: Sequence[str], allow_empty: bool = False) -> Array:
+    def numbers(
+        self, names: Sequence[str], allow_empty: bool = False, largest: float = math.inf
+    ) -> Array:
         """Columns as numbers (N, k); a bad cell is a problem and NaN in the result.
 
-        With ``allow_empty`` an empty cell is NaN without being a problem.
+        With ``allow_empty`` an empty cell is NaN without being a problem. Numbers may be as large
+        as ``largest``, with either sign.
         """
         values = np.empty((len(self), len(names)))
         for k, name in enumerate(names):
-            values[:, k] = self._column(name, allow_empty)
+            values[:, k] = self._column(name, allow_empty, largest)
         return values
 
-    def _column(self, name: str, allow_empty: bool) -> list[float]:
+    def _column(self, name: str, allow_empty: bool, largest: float) -> list[float]:
         numbers = []
         for row, cell in enumerate(self.columns[name]):
             if not cell and allow_empty:
@@ -126,6 +129,9 @@ class Table:
             number = _number(cell)
             if not math.isfinite(number):
                 self.add_problem(row, f"{name}: {_why_not_a_number(cell)}")
+                number = math.nan
+            elif abs(number) > largest:
+                self.add_problem(row, f"{name}: expected at most {largest:g}, got {quoted(cell)}")
                 number = math.nan
             numbers.append(number)
         return numbers
@@ -143,12 +149,12 @@ def _why_not_a_number(cell: str) -> str:
     if not cell:
         return "empty, expected a number"
     if cell.lower().lstrip("+-") in ("nan", "inf", "infinity"):
-        return f"expected a finite number, got {cell!r}"
+        return f"expected a finite number, got {quoted(cell)}"
     if "," in cell and math.isfinite(_number(cell.replace(",", "."))):
-        return f"expected a number with a decimal point, got {cell!r} with a decimal comma"
+        return f"expected a number with a decimal point, got {quoted(cell)} with a decimal comma"
     if cell.isascii() and "_" not in cell and _number(cell) == math.inf:
-        return f"expected a finite number, got {cell!r}"
-    return f"expected a number, got {cell!r}"
+        return f"expected a finite number, got {quoted(cell)}"
+    return f"expected a number, got {quoted(cell)}"
 
 
 def read_table(path: Path, name: str | None = None) -> Table:
@@ -241,7 +247,7 @@ def _check_separator(header: list[str], where: str) -> None:
 
 def _repeated_columns(names: list[str]) -> list[str]:
     return [
-        f"column {column!r} is there {count} times"
+        f"column {quoted(column)} is there {count} times"
         for column, count in Counter(names).items()
         if column and count > 1
     ]

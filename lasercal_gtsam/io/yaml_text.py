@@ -11,6 +11,10 @@ from lasercal_gtsam.io.files import read_text
 
 Location = tuple[str | int, ...]
 
+# Far above what a person writes, far below what takes long: an alias that stands for lists of
+# aliases makes millions of values out of ten lines.
+_MOST_CHARACTERS, _MOST_VALUES, _DEEPEST = 4_000_000, 100_000, 50
+
 
 class Lines:
     """Line numbers of the keys of a YAML file."""
@@ -38,30 +42,40 @@ def read_yaml(path: Path) -> tuple[Any, Lines, list[tuple[Location, str]]]:
     Raises
     ------
     DataError
-        The file cannot be read, is empty or is not YAML (with line and column).
+        The file cannot be read, is empty, is not YAML (with line and column) or holds more than
+        such a file can mean to.
     """
+    return parse_yaml(read_text(path), path.name)
+
+
+def parse_yaml(text: str, name: str) -> tuple[Any, Lines, list[tuple[Location, str]]]:
+    """The same of a text; ``name`` is what messages call it."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    text = read_text(path)
+    if len(text) > _MOST_CHARACTERS:
+        raise DataError(f"{name}: {len(text)} characters; expected {_MOST_CHARACTERS} at most")
     try:
         node = _plain_yaml(YAML).compose(text)
         if node is None:
-            raise DataError(f"{path.name}: the file is empty")
-        lines: dict[Location, int] = {}
-        problems: list[tuple[Location, str]] = []
-        _visit(node, (), lines, problems)
+            raise DataError(f"{name}: the file is empty")
+        visit = _Visit(name)
+        visit.node(node, ())
         reader = _plain_yaml(YAML)
         reader.allow_duplicate_keys = True
-        return reader.load(text), Lines(lines), problems
+        return reader.load(text), Lines(visit.lines), visit.problems
+    except RecursionError:
+        raise DataError(f"{name}: {_TOO_DEEP}") from None
+    except (ValueError, ArithmeticError) as error:  # a date or a number that cannot be
+        raise DataError(f"{name}: not valid YAML: {error}") from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
         about = " ".join(part for part in (error.context, error.problem) if part)
         hint = _quoting_hint(text.splitlines()[mark.line : mark.line + 1] if mark else [])
-        raise DataError(f"{path.name}{at}: not valid YAML: {about}{hint}") from None
+        raise DataError(f"{name}{at}: not valid YAML: {about}{hint}") from None
     except YAMLError as error:
-        raise DataError(f"{path.name}: not valid YAML: {error}") from None
+        raise DataError(f"{name}: not valid YAML: {error}") from None
 
 
 def _quoting_hint(line: list[str]) -> str:
@@ -75,19 +89,41 @@ def _plain_yaml(yaml_class: Any) -> Any:
     return yaml_class(typ="safe", pure=True)
 
 
-def _visit(
-    node: Any, at: Location, lines: dict[Location, int], problems: list[tuple[Location, str]]
-) -> None:
-    lines.setdefault(at, node.start_mark.line + 1)
-    if node.id == "mapping":
+_TOO_DEEP = f"lists or mappings inside each other, more than {_DEEPEST} deep"
+
+
+class _Visit:
+    """Goes through a document; what an alias stands for counts each time."""
+
+    def __init__(self, name: str) -> None:
+        self.lines: dict[Location, int] = {}
+        self.problems: list[tuple[Location, str]] = []
+        self._name, self._count = name, 0
+
+    def node(self, node: Any, at: Location) -> None:
+        line = node.start_mark.line + 1
+        self._count += 1
+        if self._count > _MOST_VALUES:
+            raise DataError(f"{self._name}:{line}: more than {_MOST_VALUES} values")
+        if len(at) > _DEEPEST:
+            raise DataError(f"{self._name}:{line}: {_TOO_DEEP}")
+        self.lines.setdefault(at, line)
+        if node.id == "mapping":
+            self._mapping(node, at)
+        elif node.id == "sequence":
+            for k, value in enumerate(node.value):
+                self.node(value, (*at, k))
+
+    def _mapping(self, node: Any, at: Location) -> None:
         first: dict[str, int] = {}
         for key, value in node.value:
-            name, line = str(key.value), key.start_mark.line + 1
+            line = key.start_mark.line + 1
+            if key.id != "scalar":
+                raise DataError(f"{self._name}:{line}: expected a word before ':', got a {key.id}")
+            name = str(key.value)
             if name in first:
-                problems.append(((*at, name), f"this key is already in line {first[name]}"))
+                problem = f"this key is already in line {first[name]}"
+                self.problems.append(((*at, name), problem))
             first.setdefault(name, line)
-            lines[(*at, name)] = line
-            _visit(value, (*at, name), lines, problems)
-    elif node.id == "sequence":
-        for k, value in enumerate(node.value):
-            _visit(value, (*at, k), lines, problems)
+            self.lines[(*at, name)] = line
+            self.node(value, (*at, name))
