@@ -1,0 +1,338 @@
+"""The inputs: small good files (the corpus), and for a number one of them spoilt, with a command."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from random import Random
+
+from fuzz_mutate import splice, spoil_bytes, spoil_json, spoil_table, spoil_value, spoil_yaml, token
+from fuzz_oracle import run
+from fuzz_pictures import HEIGHT, WIDTH, encoded, spoilt, spot
+
+SMALL = ("--preset", "paper-1", "--groups", "3", "--shots", "4")
+FAST = ("--initial", "spots/truth.json", "--robust", "none", "--distortion", "none")
+PICTURES = 6
+
+
+@dataclass(frozen=True)
+class Input:
+    """One input: which files are other than in the corpus, and the command that reads them."""
+
+    kind: str
+    args: tuple[str, ...]
+    files: Mapping[str, bytes]
+    stdin: bytes = b""
+    results: tuple[str, ...] = ()
+
+
+# --- the corpus ---------------------------------------------------------------------------------
+
+
+def make_corpus(folder: Path) -> dict[str, bytes]:
+    """Files by name below the folder that commands are run in."""
+    here = Path.cwd()
+    folder.mkdir(parents=True)
+    os.chdir(folder)
+    try:
+        _run("simulate", "spots", *SMALL)
+        _run("simulate", "matrix", *SMALL, "--rotation", "matrix", "--length", "m", "--seed", "1")
+        _run("simulate", "two", "--preset", "paper-2", "--groups", "3", "--shots", "4")
+        _run("calibrate", "spots", *FAST)
+        _run("calibrate", "two", "--initial", "two/truth.json", "--distortion", "none")
+        _with_spot_table()
+        _with_pictures()
+        more = _renamed(Path("spots"), "more")
+        _run("watch", more, "--calibration", "spots/calibration.json", "--once")
+    finally:
+        os.chdir(here)
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and not path.name.endswith(".writer")
+    }
+
+
+def _run(*args: str) -> None:
+    outcome = run(args, limit_s=300)
+    if outcome.status:
+        raise RuntimeError(f"{args}: {outcome.status} {outcome.err} {outcome.trace}")
+
+
+def _renamed(source: Path, name: str) -> str:
+    """A capture with the first four rows of another, under new names."""
+    target = source.parent / name
+    target.mkdir()
+    shutil.copy(source / "capture.yaml", target)
+    rows = (source / "poses.csv").read_text().splitlines()[:5]
+    (target / "poses.csv").write_text("\n".join([rows[0], *(f"m{row}" for row in rows[1:]), ""]))
+    return name
+
+
+def _with_spot_table() -> None:
+    """A capture whose spots are in a table of their own, with sigmas and verdicts."""
+    folder = Path("tables")
+    folder.mkdir()
+    head = Path("spots/capture.yaml").read_text()
+    (folder / "capture.yaml").write_text(head + "spots: {file: spots.csv}\nplanes: ['1']\n")
+    rows = [line.split(",") for line in Path("spots/poses.csv").read_text().splitlines()]
+    u, v = rows[0].index("u"), rows[0].index("v")
+    assert (u, v) == (len(rows[0]) - 2, len(rows[0]) - 1)
+    (folder / "poses.csv").write_text("".join(",".join(row[:-2]) + "\n" for row in rows))
+    lines = ["id,u,v,sigma_u,sigma_v,rho_uv,verdict,reason"]
+    lines += [f"{row[0]},{row[u]},{row[v]},0.5,0.4,0.1,used," for row in rows[1:]]
+    (folder / "spots.csv").write_text("\n".join([*lines, ""]))
+
+
+def _with_pictures() -> None:
+    folder = Path("pictures")
+    (folder / "images").mkdir(parents=True)
+    (folder / "capture.yaml").write_text(
+        f"lasercal: 1\ncamera: {{name: camera, width: {WIDTH}, height: {HEIGHT}}}\n"
+        "poses:\n  file: poses.csv\n  transform: T_base_hand\n  length: mm\n  rotation: kuka\n"
+        'images: {on: "images/{id}.png", off: "images/{id}_off.png"}\n'
+    )
+    lines = ["id,plane,x,y,z,a,b,c"]
+    for k in range(PICTURES):
+        lines.append(f"p{k},1,{500 + 10 * k},{7 * k},300,{3 * k},0,180")
+        for name, lit in ((f"p{k}", True), (f"p{k}_off", False)):
+            (folder / "images" / f"{name}.png").write_bytes(encoded(".png", spot(k, lit)))
+    (folder / "poses.csv").write_text("\n".join([*lines, ""]))
+
+
+# --- the inputs ---------------------------------------------------------------------------------
+
+Corpus = Mapping[str, bytes]
+
+
+def _calibrate(folder: str, *more: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return ("calibrate", folder, *FAST, *more), (f"{folder}/calibration.json",)
+
+
+def _any(
+    rng: Random, content: bytes, other: bytes, structured: Callable[[Random, bytes], bytes]
+) -> bytes:
+    kind = rng.random()
+    if kind < 0.6:
+        return structured(rng, content)
+    return splice(rng, content, other) if kind < 0.65 else spoil_bytes(rng, content)
+
+
+def head(rng: Random, corpus: Corpus) -> Input:
+    folder = rng.choice(("spots", "tables", "matrix"))
+    name = f"{folder}/capture.yaml"
+    content = _any(rng, corpus[name], corpus["pictures/capture.yaml"], spoil_yaml)
+    return Input("capture.yaml", *_swap(_calibrate(folder), {name: content}))
+
+
+def poses(rng: Random, corpus: Corpus) -> Input:
+    folder = rng.choice(("spots", "matrix"))
+    name = f"{folder}/poses.csv"
+    content = _any(rng, corpus[name], corpus["tables/spots.csv"], spoil_table)
+    return Input("poses.csv", *_swap(_calibrate(folder), {name: content}))
+
+
+def spots(rng: Random, corpus: Corpus) -> Input:
+    content = _any(rng, corpus["tables/spots.csv"], corpus["spots/poses.csv"], spoil_table)
+    return Input("spots.csv", *_swap(_calibrate("tables"), {"tables/spots.csv": content}))
+
+
+def both(rng: Random, corpus: Corpus) -> Input:
+    """Poses that are read and spoilt, calibrated from nothing: no start is given."""
+    folder = rng.choice(("spots", "matrix", "two"))
+    files = {f"{folder}/poses.csv": spoil_table(rng, corpus[f"{folder}/poses.csv"])}
+    known = rng.choice(
+        ((), ("--known", f"fu={token(rng)}"), ("--robust", "none"), ("--robust", "huber"))
+    )
+    args = ("calibrate", folder, "--distortion", rng.choice(("none", "k1")), *known)
+    return Input("poses.csv, no start", args, files, results=(f"{folder}/calibration.json",))
+
+
+def check(rng: Random, corpus: Corpus) -> Input:
+    folder = rng.choice(("spots", "matrix", "tables"))
+    files = {f"{folder}/poses.csv": spoil_table(rng, corpus[f"{folder}/poses.csv"])}
+    return Input("check", ("check", folder), files)
+
+
+def _json_of(rng: Random, content: bytes, other: bytes) -> bytes:
+    return _any(rng, content, other, spoil_json)
+
+
+def calibration(rng: Random, corpus: Corpus) -> Input:
+    folder = rng.choice(("spots", "two"))
+    name = f"{folder}/calibration.json"
+    files = {name: _json_of(rng, corpus[name], corpus["spots/truth.json"])}
+    if rng.random() < 0.1:
+        return Input("calibration.json, judge", ("judge", name), files)
+    args = ("update", name, folder, "-o", "out.json")
+    return Input("calibration.json", args, files, results=("out.json", "out.history.csv"))
+
+
+def update(rng: Random, corpus: Corpus) -> Input:
+    """A calibration that can be read, and spots that are new to it."""
+    name = "spots/calibration.json"
+    files = {"more/poses.csv": spoil_table(rng, corpus["more/poses.csv"])}
+    if rng.random() < 0.5:
+        files = {name: spoil_json(rng, corpus[name])}
+    args = (
+        "update",
+        name,
+        "more",
+        "-o",
+        "out.json",
+        *rng.choice(((), ("--reset", "camera"), ("--automatic",))),
+    )
+    return Input("update", args, files, results=("out.json", "out.history.csv"))
+
+
+def cell(rng: Random, corpus: Corpus) -> Input:
+    files = {
+        "spots/truth.json": _json_of(rng, corpus["spots/truth.json"], corpus["two/truth.json"])
+    }
+    args, results = _calibrate("spots")
+    return Input("cell file", args, files, results=results)
+
+
+def history(rng: Random, corpus: Corpus) -> Input:
+    name = "more/calibration.history.csv"
+    content = _any(rng, corpus[name], corpus["spots/poses.csv"], spoil_table)
+    names = rng.choice(((), ("fu",), ("*",), (token(rng).replace("\0", "") or "x",)))
+    args = ("history", name, *rng.choice(((), ("--json",))), "--", *names)
+    return Input("history", args, {name: content})
+
+
+def journal(rng: Random, corpus: Corpus) -> Input:
+    name = "more/calibration.journal.jsonl"
+    content = corpus[name]
+    if rng.random() < 0.5:
+        content = _resealed(rng, content)
+    else:
+        content = spoil_bytes(rng, content)
+    files = {name: content}
+    if rng.random() < 0.3:
+        copy = f"{name}.start"
+        files = {copy: spoil_bytes(rng, corpus[copy])}
+    args = ("watch", "more", "--once")
+    return Input("journal", args, files, results=("watch", "more/calibration.json", Path(name).name,
+                                                   "more/calibration.history.csv", name))  # fmt: skip
+
+
+def _resealed(rng: Random, content: bytes) -> bytes:
+    """A journal whose records are whole but say something else."""
+    from lasercal_gtsam.io.journal_lines import sealed
+
+    lines = content.splitlines(keepends=True)
+    at = rng.randrange(len(lines))
+    record = json.loads(lines[at])
+    place = {"kind": record["kind"], "payload": record["payload"]}
+    place = spoil_value(rng, place)
+    if isinstance(place, dict) and isinstance(place.get("payload"), dict):
+        kind = place.get("kind", "spot")
+        try:
+            seal = sealed(
+                record["seq"], record["batch"], kind if at else record["kind"], place["payload"]
+            )
+            lines[at] = seal
+        except Exception:
+            lines[at] = spoil_bytes(rng, lines[at])
+    else:
+        lines.insert(at, lines[rng.randrange(len(lines))])
+    return b"".join(lines)
+
+
+def stdin(rng: Random, corpus: Corpus) -> Input:
+    spot = {
+        "id": "n1",
+        "plane": "1",
+        "uv": [300.0, 200.0],
+        "T_base_hand": [[1.0, 0, 0, 0.5], [0, -1.0, 0, 0.1], [0, 0, -1.0, 0.4], [0, 0, 0, 1]],
+        "sigma_px": 0.5,
+    }
+    columns = {"id": "n2", "plane": "1", "uv": [310.0, 220.0], "x": 500.0, "y": 100.0, "z": 400.0}
+    columns |= {"qw": 0.0, "qx": 1.0, "qy": 0.0, "qz": 0.0, "cov_uv": [[1.0, 0.1], [0.1, 1.0]]}
+    others: list[object] = [
+        {"reset": {"camera": "camera"}},
+        {"dismiss": True},
+        {"image_size": [640, 480]},
+    ]
+    lines = []
+    for _ in range(rng.choice((1, 1, 3))):
+        document = json.dumps(rng.choice([spot, spot, columns, columns, *others])).encode()
+        kind = rng.random()
+        lines.append(spoil_json(rng, document) if kind < 0.6 else spoil_bytes(rng, document))
+    start = ("--calibration", "spots/calibration.json") if rng.random() < 0.5 else ()
+    args = ("watch", *rng.choice((("spots",), ())), "--stdin", "--once", "-o", "out.json", *start)
+    ends = rng.choice((b"\n", b"\n", b"\r\n", b"\n\n"))
+    results = ("watch", "out.json", "out.history.csv", "out.journal.jsonl")
+    return Input("lines on stdin", args, {}, ends.join([*lines, b""]), results)
+
+
+def picture(rng: Random, corpus: Corpus) -> Input:
+    off = "_off" if rng.random() < 0.3 else ""
+    name = f"pictures/images/p{rng.randrange(PICTURES)}{off}.png"
+    results = ("pictures/spots.csv", "pictures/contact-sheet.png")
+    return Input("picture", ("detect", "pictures"), {name: spoilt(rng)}, results=results)
+
+
+def options(rng: Random, corpus: Corpus) -> Input:
+    """Odd values of options, mostly for commands that end soon."""
+    word = token(rng).replace("\0", "")
+    choices = (
+        (*_calibrate("spots")[0], rng.choice(("--known", "--fixed", "--sigma-px", "--robust", "--distortion")), word),
+        (*_calibrate("spots")[0], "--known", f"{rng.choice(('fu', 'u0', 'aspect', 'k1', 'principal_point', 'skew', 'v0', word))}={word}"),
+        (*_calibrate("spots")[0], "--fixed", f"{rng.choice(('camera', 'laser', 'plane'))}:{word}"),
+        (*_calibrate("spots")[0], "--sigma-px", rng.choice(("1e-300", "1e300", "1e-160", "1e160", "1e-20", "1e9"))),
+        ("calibrate", word, *FAST),
+        ("calibrate", "spots", "--initial", word),
+        (*_calibrate("spots")[0], "-o", word),
+        ("detect", "pictures", "--set", f"{rng.choice(('channel', 'ambiguous_ratio', 'saturation_level', 'region', 'threshold_sigmas', 'divide_albedo', word))}={word}"),
+        ("detect", "pictures", "-o", word),
+        ("update", "spots/calibration.json", "more", "-o", "out.json", "--reset", rng.choice((f"camera:{word}", word, "laser", "plane:1"))),
+        ("update", "spots/calibration.json", "more", "-o", "out.json", "--prefix", word),
+        ("history", "more/calibration.json", word),
+        ("history", "more/calibration.history.csv", "--plot", word),
+        ("watch", "more", "--once", rng.choice(("--max-spots", "--half-life", "--interval", "--until-idle", "--reset", "--journal", "--prefix")), word),
+        ("check", word),
+        ("judge", word),
+        ("check-sigma", word),
+        ("simulate", "new", rng.choice(("--preset", "--seed", "--rotation", "--length", "--bits", "--ambient", "--transform")), word),
+        ("simulate", "new", *SMALL, rng.choice(("--noise", "--pixel-px", "--hand-mm", "--hand-deg")), word),
+        (word, "spots"),
+        (rng.choice(("calibrate", "check", "update", "detect", "history", "simulate", "judge", "watch")), rng.choice(("--", "-", word)), word),
+    )  # fmt: skip
+    return Input("options", rng.choice(choices), {}, results=("*",))
+
+
+def _swap(
+    command: tuple[tuple[str, ...], tuple[str, ...]], files: Mapping[str, bytes]
+) -> tuple[tuple[str, ...], Mapping[str, bytes], bytes, tuple[str, ...]]:
+    args, results = command
+    return args, files, b"", results
+
+
+KINDS: Mapping[Callable[[Random, Corpus], Input], float] = {
+    head: 19,
+    poses: 18,
+    spots: 8,
+    both: 1.5,
+    check: 0.5,
+    calibration: 12,
+    update: 2,
+    cell: 6,
+    history: 8,
+    journal: 6,
+    stdin: 8,
+    picture: 8,
+    options: 3,
+}
+
+
+def make_input(seed: int, number: int, corpus: Corpus) -> Input:
+    """The input of that number."""
+    rng = Random(f"{seed}:{number}")
+    make = rng.choices(list(KINDS), list(KINDS.values()))[0]
+    return make(rng, corpus)
