@@ -24,6 +24,7 @@ from lasercal_gtsam.cli.export import export
 from lasercal_gtsam.cli.history import history
 from lasercal_gtsam.cli.importing import import_recording
 from lasercal_gtsam.cli.judge import judge
+from lasercal_gtsam.cli.report import report
 from lasercal_gtsam.cli.simulate import simulate
 from lasercal_gtsam.cli.update import update
 from lasercal_gtsam.cli.watch import watch
@@ -53,6 +54,7 @@ for _command in (
     check,
     check_sigma,
     judge,
+    report,
     import_recording,
     detect,
     update,

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Literal
 
 from lasercal_gtsam.cell import Cell
-from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.simulate.noise import Noise
 from lasercal_gtsam.simulate.simulation import Simulation
 from lasercal_gtsam.units import DEG_PER_RAD, MM_PER_M
@@ -61,35 +59,25 @@ def write_simulation(
     """
     from lasercal_gtsam.io.capture import CAPTURE_FILE
     from lasercal_gtsam.io.capture_writer import write_capture
-    from lasercal_gtsam.io.files import write_text
+    from lasercal_gtsam.io.files import whole_folder, write_text
     from lasercal_gtsam.io.plain import to_json
 
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise DataError(f"{folder}: the folder is not empty; give a new one")
-        with TemporaryDirectory(prefix=".writing-", dir=folder) as staging:
-            write_capture(
-                staging,
-                simulation.observations,
-                transform=transform,
-                length=length,
-                rotation=rotation,
-                with_spots=spots,
-                images=_patterns(pictures),
-                noise=_stated(simulation.noise, spots) if state_noise else None,
-                known=simulation.known,
-            )
-            write_text(Path(staging) / TRUTH_FILE, to_json(truth_to_dict(simulation)) + "\n")
-            if pictures is not None:
-                _write_pictures(Path(staging), simulation, pictures, progress)
-            written = sorted(Path(staging).iterdir(), key=lambda path: path.name == CAPTURE_FILE)
-            for path in written:  # the capture itself last
-                path.rename(folder / path.name)
-    except OSError as error:
-        raise DataError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    return folder / CAPTURE_FILE
+    with whole_folder(folder, last=CAPTURE_FILE) as staging:
+        write_capture(
+            staging,
+            simulation.observations,
+            transform=transform,
+            length=length,
+            rotation=rotation,
+            with_spots=spots,
+            images=_patterns(pictures),
+            noise=_stated(simulation.noise, spots) if state_noise else None,
+            known=simulation.known,
+        )
+        write_text(staging / TRUTH_FILE, to_json(truth_to_dict(simulation)) + "\n")
+        if pictures is not None:
+            _write_pictures(staging, simulation, pictures, progress)
+    return Path(folder) / CAPTURE_FILE
 
 
 def truth_to_dict(simulation: Simulation) -> dict[str, Any]:
@@ -155,21 +143,13 @@ def _write_pictures(
     options: PictureOptions,
     progress: Callable[[int, int], None] | None,
 ) -> None:
+    from lasercal_gtsam.io.pictures import write_png
     from lasercal_gtsam.simulate.pictures import render_pictures
 
     (folder / _ON).parent.mkdir()
     for done, shot in enumerate(render_pictures(simulation, options), start=1):
-        _write_png(folder / _ON.format(id=shot.id), shot.on)
+        write_png(folder / _ON.format(id=shot.id), shot.on)
         if options.off:
-            _write_png(folder / _OFF.format(id=shot.id), shot.off)
+            write_png(folder / _OFF.format(id=shot.id), shot.off)
         if progress is not None:
             progress(done, len(simulation.observations))
-
-
-def _write_png(path: Path, picture: Any) -> None:
-    import cv2
-
-    encoded, content = cv2.imencode(".png", picture)
-    if not encoded:
-        raise DataError(f"{path}: the picture could not be encoded as PNG")
-    path.write_bytes(content.tobytes())
