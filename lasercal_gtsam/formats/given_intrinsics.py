@@ -1,0 +1,159 @@
+"""Intrinsics from elsewhere in a calibration: as known values, as priors, or as a start."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Literal, get_args
+
+from lasercal_gtsam.cell import INTRINSIC_NAMES, Camera, Cell
+from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.formats.intrinsics import KnownIntrinsics
+from lasercal_gtsam.observations import Observations
+from lasercal_gtsam.options import CalibrationOptions
+
+How = Literal["known", "prior", "start"]
+# names of the table's rows, which priors are on
+ROWS = tuple("alpha_c" if name == "skew" else name for name in INTRINSIC_NAMES)
+
+
+def with_intrinsics(
+    options: CalibrationOptions,
+    observations: Observations,
+    given: Mapping[str, KnownIntrinsics],
+    how: How,
+    sigmas: Mapping[str, float] | None = None,
+) -> tuple[CalibrationOptions, tuple[str, ...]]:
+    """Options with lenses held at what files say (``"known"``), or with priors on them.
+
+    A prior is on each number for itself: what a file's covariance says of how they go together is
+    not used. Numbers without a sigma, in the file or in ``sigmas``, cannot have a prior; a number
+    that was held where the file was made (sigma 0) is held here. ``"start"`` changes no options:
+    see `start_with_intrinsics`.
+
+    Parameters
+    ----------
+    options, observations : of the calibration
+    given : camera name to its lens
+    how : what is done with them
+    sigmas : sigma of rows of the table (`ROWS`), wins over the files'; px, alpha_c without unit
+
+    Returns
+    -------
+    the options, and words on what could not be used
+
+    Raises
+    ------
+    DataError
+        Unknown cameras, pictures of another size, no sigmas for priors.
+    """
+    check_given(observations, given, how)
+    if how == "start":
+        return options, ()
+    if how == "known":
+        known = dict(options.known)
+        for name, lens in given.items():
+            prefix = _prefix(observations, name)
+            # what names the same numbers in other words
+            for other in ("principal_point", "aspect"):
+                known.pop(prefix + other, None)
+            known |= {prefix + k: float(getattr(lens.intrinsics, k)) for k in INTRINSIC_NAMES}
+        return replace(options, known=known), ()
+    known, priors = dict(options.known), dict(options.priors)
+    words: list[str] = []
+    for name, lens in given.items():
+        prefix = _prefix(observations, name)
+        found = {**prior_sigmas(lens), **(sigmas or {})}
+        if missing := [row for row in ROWS if row not in found]:
+            raise DataError(
+                f"{lens.path}: a {lens.form} file without a covariance: a prior needs a sigma for "
+                f"{', '.join(missing)} (--intrinsics-sigma NAME=SIGMA); or take it as known, or as "
+                "a start"
+            )
+        for row, term in zip(ROWS, INTRINSIC_NAMES, strict=True):
+            value = getattr(lens.intrinsics, "alpha_c" if row == "alpha_c" else term)
+            if found[row] > 0:
+                priors.setdefault(prefix + row, (float(value), found[row]))
+            else:
+                known.setdefault(prefix + term, float(getattr(lens.intrinsics, term)))
+        if lens.covariance is not None:
+            words.append(
+                f"{lens.path}: the sigmas are used as priors, not how the numbers go together"
+            )
+    return replace(options, known=known, priors=priors), tuple(words)
+
+
+def start_with_intrinsics(
+    observations: Observations,
+    options: CalibrationOptions,
+    given: Mapping[str, KnownIntrinsics],
+    initial: Cell | None = None,
+) -> Cell:
+    """A start with these lenses: ``initial`` with them, or the best cell while they are held.
+
+    Raises
+    ------
+    DataError, DegenerateError, SolveError
+        As `calibrate` does.
+    """
+    check_given(observations, given, "start")
+    if initial is not None:
+        cameras = {
+            name: Camera(
+                given[name].intrinsics if name in given else camera.intrinsics,
+                camera.T_base_camera,
+                camera.image_size,
+            )
+            for name, camera in initial.cameras.items()
+        }
+        return replace(initial, cameras=cameras)
+    from lasercal_gtsam.api import calibrate
+
+    held, _ = with_intrinsics(options, observations, given, "known")
+    # a prior on what is held means nothing
+    rows = {_prefix(observations, name) + row for name in given for row in (*ROWS, "aspect")}
+    priors = {k: v for k, v in options.priors.items() if k not in rows}
+    return calibrate(observations, options=replace(held, priors=priors)).cell
+
+
+def prior_sigmas(lens: KnownIntrinsics) -> dict[str, float]:
+    """Sigmas of the table's rows from a file's covariance; empty where it has none."""
+    if lens.covariance is None:
+        return {}
+    sigmas = lens.sigmas
+    C, intrinsics = lens.covariance, lens.intrinsics
+    # alpha_c = skew / fu
+    by_fu, by_skew = -intrinsics.skew / intrinsics.fu**2, 1 / intrinsics.fu
+    variance = by_fu**2 * C[0, 0] + 2 * by_fu * by_skew * C[0, 2] + by_skew**2 * C[2, 2]
+    held = sigmas.pop("skew") == 0
+    sigmas["alpha_c"] = 0.0 if held else float(max(variance, 0.0)) ** 0.5
+    return sigmas
+
+
+def check_given(observations: Observations, given: Mapping[str, KnownIntrinsics], how: How) -> None:
+    """Raise `DataError` where a lens cannot belong to the camera it is given for."""
+    if how not in get_args(How):
+        raise DataError(f"intrinsics: expected one of {', '.join(get_args(How))}, got {how!r}")
+    problems = []
+    for name, lens in given.items():
+        if name not in observations.cameras:
+            problems.append(
+                f"{lens.path}: given for camera {name!r}; observed: "
+                f"{', '.join(observations.cameras)}"
+            )
+        elif lens.image_size not in (None, observations.image_size[name]):
+            problems.append(
+                f"{lens.path}: the intrinsics are of pictures of {_size(lens.image_size)}, but "
+                f"camera {name!r} has {_size(observations.image_size[name])}: another camera, or a "
+                "scaled or cropped picture; intrinsics are not scaled here"
+            )
+    if problems:
+        raise DataError(*problems)
+
+
+def _prefix(observations: Observations, camera: str) -> str:
+    return f"{camera}." if len(observations.cameras) > 1 else ""
+
+
+def _size(size: tuple[int, int] | None) -> str:
+    return "unknown size" if size is None else f"{size[0]} x {size[1]} px"
