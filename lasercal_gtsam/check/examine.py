@@ -167,6 +167,7 @@ def _given_spots(capture: Capture) -> Observations | None:
         plane=capture.planes[given],
         id=capture.ids[given],
         image_size=capture.image_size,
+        stop=None if capture.stops is None else capture.stops[given],
     )
 
 

@@ -8,10 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
+from lasercal_gtsam.cli.given_lens import GivenLens, intrinsics_options
 from lasercal_gtsam.cli.outputs import check_calibration_target
+from lasercal_gtsam.cli.report import report_target
+from lasercal_gtsam.cli.report import write as write_report
 from lasercal_gtsam.cli.texts import account_lines, count, looked_at, result_lines
 from lasercal_gtsam.cli.values import Assignment, Distortion, Number
 from lasercal_gtsam.errors import DataError, DegenerateError, SolveError
+from lasercal_gtsam.options import HAND_NOISE_NAMES
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
@@ -79,10 +83,24 @@ CALIBRATION_FILE = "calibration.json"
     help="Sigma of pixels that have none of their own; wins over capture.yaml.",
 )
 @click.option(
+    "--estimate-noise",
+    is_flag=True,
+    help="Estimate the noise of the hand poses from the residuals, whatever capture.yaml states, "
+    "and that of the pixels where none is stated.",
+)
+@click.option(
     "--keep-unconverged",
     is_flag=True,
     help="Save also an answer that cannot be trusted (the exit status stays 1).",
 )
+@click.option(
+    "--report",
+    "page",
+    metavar="PATH",
+    type=click.Path(path_type=Path),
+    help="Also write the uncertainty report, one HTML file; see 'lasercal report'.",
+)
+@intrinsics_options
 @json_option
 def calibrate(
     capture: Path,
@@ -93,7 +111,10 @@ def calibrate(
     fixed: tuple[str, ...],
     robust: str,
     sigma_px: float | None,
+    estimate_noise: bool,
     keep_unconverged: bool,
+    page: Path | None,
+    lens: GivenLens,
     as_json: bool,
 ) -> int:
     """Calibrate the cell of CAPTURE (capture.yaml, or its folder) and save the result.
@@ -106,15 +127,19 @@ def calibrate(
     loaded = load_capture(capture)
     warn(loaded.warnings)
     target = _target(output, loaded.path)
+    page = None if page is None else report_target(page, loaded.path.parent)
     start = _start(initial)
     with progress("Looking at pictures") as show:
         account = loaded.detections(progress=show)
     warn(account.notes)
     observations = loaded.observations(account=account)
-    given = {} if sigma_px is None else {"sigma_px": sigma_px}
+    given: dict[str, Any] = {} if sigma_px is None else {"sigma_px": sigma_px}
+    if estimate_noise:
+        given |= {"estimate_noise": HAND_NOISE_NAMES, **dict.fromkeys(HAND_NOISE_NAMES, 0.0)}
     options = loaded.options(
         distortion=distortion, robust=robust, fixed=fixed, known=dict(known), **given
     )
+    options, start = lens.apply(observations, options, start, dict(known))
 
     from lasercal_gtsam.api import calibrate as solve
 
@@ -130,12 +155,14 @@ def calibrate(
             saved = target
         except DataError as error:  # a full disk must not cost the answer
             failure = error
+    if page is not None:  # of an answer that cannot be trusted too: it says why
+        save_report(result, page, loaded, account, saved)
     if as_json:
         print_json(_document(result, loaded, account, saved))
     else:
         click.echo("\n".join(_report(result, loaded, account)))
-        if saved is not None:
-            click.echo(f"Saved {saved}.")
+        for path in filter(None, (saved, page)):
+            click.echo(f"Saved {path}.")
     if failure is not None:
         raise failure
     if _fits_badly(result):
@@ -162,6 +189,16 @@ def save(result: Calibration, path: Path, capture: Capture) -> None:
     from lasercal_gtsam.io.calibration_file import save_calibration
 
     save_calibration(result, path, sources=capture.provenance)
+
+
+def save_report(
+    result: Calibration, page: Path, capture: Capture, account: SpotAccount, saved: Path | None
+) -> None:
+    """Write the report, with pictures of what was left out."""
+    from lasercal_gtsam.report.material import Origin
+
+    origin = Origin(files=capture.provenance) if saved is None else Origin.of_file(saved)
+    write_report(result, page, origin, capture, account)
 
 
 def _target(output: Path | None, capture: Path) -> Path:

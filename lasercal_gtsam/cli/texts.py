@@ -66,9 +66,8 @@ def result_lines(calibration: Calibration, table: str | None = None) -> list[str
         "with --known:",
         [direction.words for direction in observability.weak],
     )
-    if not calibration.fit.converged:  # otherwise they are part of the status
-        lines += _section("Remarks:", observability.notes)
-    return lines
+    remarks = [note for note in observability.notes if note not in calibration.fit.status]
+    return [*lines, *_section("Remarks:", remarks)]
 
 
 def _section(heading: str, lines: Sequence[str]) -> list[str]:

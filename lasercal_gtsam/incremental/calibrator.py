@@ -92,7 +92,7 @@ class IncrementalCalibrator:
         half_life: float | None = None,
     ) -> None:
         if options is None:
-            options = CalibrationOptions() if calibration is None else calibration.inputs.options
+            options = CalibrationOptions() if calibration is None else calibration.options_used
         sigma_px = options.sigma_px or 1.0
         self._settings = Settings(options, automatic, max_spots, half_life, sigma_px)
         self._store = SpotStore({})

@@ -143,7 +143,7 @@ def _residuals(cell: Cell, seen: Observations, account: Account) -> tuple[Array,
     names = {k: getattr(spots, k).tolist() for k in ("plane", "camera", "laser")}
     residuals[rows] = project(cell, spots.T_base_hand, **names) - spots.uv
     cov = pixel_covariances(spots, account.sigma_px)
-    noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
+    noise = HandNoise.of(options)
     part = cell.restricted(spots)
     if max(noise) > 0:
         eta = np.zeros((len(spots), 6))

@@ -50,7 +50,7 @@ class Settings:
     @property
     def hand(self) -> HandNoise:
         """Declared noise of a hand pose."""
-        return HandNoise(self.options.hand_sigma_m, self.options.hand_sigma_rad)
+        return HandNoise.of(self.options)
 
     @property
     def weighing(self) -> Weighing:
@@ -69,7 +69,8 @@ class Settings:
         return self.options.sigma_px is None and max(self.hand) > 0
 
     def informed_by(self, found: Calibration) -> Settings:
-        """With the pixel sigma that a solution has found, where one was missing."""
-        if not self.finds_sigma:
-            return self
-        return replace(self, sigma_px=found.fit.sigma0, unit=found.fit.sigma0)
+        """With the noise levels that a solution has found, where some were missing."""
+        told = replace(self, options=found.options_used) if found.fit.noise else self
+        if not told.finds_sigma:
+            return told
+        return replace(told, sigma_px=found.fit.sigma0, unit=found.fit.sigma0)

@@ -14,6 +14,7 @@ from lasercal_gtsam.calibration import (
     Calibration,
     Fit,
     Inputs,
+    NoiseLevel,
     Observability,
     Parameter,
     SpotResults,
@@ -210,6 +211,16 @@ class CovarianceModel(_Part):
     matrix: Matrix
 
 
+class NoiseLevelModel(_Part):
+    """A noise level that was estimated."""
+
+    name: str
+    value: Number
+    standard_error: Number
+    low: Number
+    high: Number
+
+
 class FitModel(_Part):
     """How the fit went."""
 
@@ -221,6 +232,12 @@ class FitModel(_Part):
     status: str
     n_spots: int
     n_rejected: int
+    noise: list[NoiseLevelModel] = []  # unknown to older files
+
+    def build(self) -> Fit:
+        """The account of the fit."""
+        noise = tuple(NoiseLevel(**level.model_dump()) for level in self.noise)
+        return Fit(**{**self.model_dump(exclude={"noise"}), "noise": noise})
 
 
 class SpotModel(_Part):
@@ -262,6 +279,7 @@ class ObservationsModel(_Part):
     uv: Rows2
     cov_uv: Rows4 | None
     T_base_hand: Rows16
+    stop: list[str] | None = None  # unknown to older files
 
     def build(self) -> Observations:
         """The observations."""
@@ -280,6 +298,7 @@ class ObservationsModel(_Part):
             plane=np.array(self.plane, dtype=np.str_),
             id=np.array(self.id, dtype=np.str_),
             image_size={name: (size[0], size[1]) for name, size in self.image_size.items()},
+            stop=None if self.stop is None else np.array(self.stop, dtype=np.str_),
         )
 
 
@@ -326,7 +345,7 @@ class CalibrationModel(CellModel):
             parameters=tuple(Parameter(**row.model_dump()) for row in self.parameters),
             covariance=self.covariance.matrix,
             labels=tuple(self.covariance.labels),
-            fit=Fit(**self.fit.model_dump()),
+            fit=self.fit.build(),
             spots=self._spots(),
             observability=Observability(
                 tuple(WeakDirection(w.strength, w.words) for w in self.observability.weak),

@@ -33,11 +33,15 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class CaptureNoise:
-    """What the user says about the noise, 1 sigma; None or 0 where he says nothing."""
+    """What the user says about the noise, 1 sigma; None or 0 where he says nothing.
+
+    ``estimate``: as ``CalibrationOptions.estimate_noise``.
+    """
 
     sigma_px: float | None = None
     hand_sigma_m: float = 0.0
     hand_sigma_rad: float = 0.0
+    estimate: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +62,7 @@ class Capture(FrozenData):
     noise, known : as given by the user; ``known`` in the form of ``CalibrationOptions.known``
     provenance : file name to SHA-256 of ``capture.yaml`` and the tables
     warnings : what was found odd but not wrong, one sentence each
+    stops : as of `Observations`; None where the table has no such column
     """
 
     path: Path
@@ -78,12 +83,15 @@ class Capture(FrozenData):
     known: Mapping[str, Any]
     provenance: Mapping[str, str]
     warnings: tuple[str, ...]
+    stops: Names | None = None
 
     def __post_init__(self) -> None:
         count = len(set_array(self, "T_base_hand", self.T_base_hand, (None, 4, 4)))
         set_array(self, "uv", self.uv, (count, 2), finite=False)
         set_array(self, "cov_uv", self.cov_uv, (count, 2, 2), finite=False)
-        for name in ("ids", "planes", "cameras", "lasers"):
+        for name in ("ids", "planes", "cameras", "lasers", "stops"):
+            if name == "stops" and self.stops is None:
+                continue
             values = np.array(getattr(self, name), dtype=np.str_)
             values.flags.writeable = False
             object.__setattr__(self, name, values)
@@ -166,6 +174,7 @@ class Capture(FrozenData):
             plane=self.planes[rows],
             id=self.ids[rows],
             image_size=self.image_size,
+            stop=None if self.stops is None else self.stops[rows],
         )
 
     def options(self, **overrides: Any) -> CalibrationOptions:
@@ -282,6 +291,7 @@ def load_capture(path: str | Path) -> Capture:
             *image_warnings,
             *noise_warnings,
         ),
+        stops=None if rows.stops is None else np.array(rows.stops, dtype=np.str_),
     )
 
 
@@ -293,6 +303,7 @@ def stated_options(
         "sigma_px": noise.sigma_px,
         "hand_sigma_m": noise.hand_sigma_m,
         "hand_sigma_rad": noise.hand_sigma_rad,
+        "estimate_noise": noise.estimate,
     }
     chosen = dict(overrides or {})
     merged = {**known, **chosen.pop("known", {})}
@@ -333,10 +344,17 @@ def known_values(head: CaptureHead) -> dict[str, Any]:
 
 def stated_noise(head: CaptureHead, name: str) -> tuple[CaptureNoise, list[str]]:
     """The noise that ``capture.yaml`` states, and warnings about it."""
+    from lasercal_gtsam.io.capture_head import HAND_KEYS
+
     said = head.noise
     if said is None:
         return CaptureNoise(), []
     warnings = []
+    twice = [key for key in said.estimate if getattr(said, key)]
+    if twice:
+        raise DataError(
+            f"{name}: noise.estimate: {twice[0]} is to be estimated, but also stated; leave one out"
+        )
     if said.pixel == 0:
         warnings.append(
             f"{name}: noise.pixel is 0, which cannot weigh anything; it is taken as not stated and "
@@ -346,6 +364,7 @@ def stated_noise(head: CaptureHead, name: str) -> tuple[CaptureNoise, list[str]]
         sigma_px=said.pixel or None,
         hand_sigma_m=said.hand_translation_mm / MM_PER_M,
         hand_sigma_rad=said.hand_rotation_deg * RAD_PER_DEG,
+        estimate=tuple(HAND_KEYS[key] for key in said.estimate),
     )
     return noise, warnings
 

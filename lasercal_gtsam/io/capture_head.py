@@ -16,6 +16,8 @@ from lasercal_gtsam.io.schema import Location, Strict, dotted, validation_proble
 from lasercal_gtsam.io.wording import at_most, cannot_be_a_name, did_you_mean, quoted
 from lasercal_gtsam.io.yaml_text import Lines, read_yaml
 
+# of the section noise, and their names among the options
+HAND_KEYS = {"hand_translation_mm": "hand_sigma_m", "hand_rotation_deg": "hand_sigma_rad"}
 KNOWN_NAMES = ("principal_point", "aspect", *INTRINSIC_NAMES)
 
 
@@ -105,6 +107,9 @@ class NoiseHead(Strict):
     hand_rotation_deg: Sigma = Field(
         0.0, description="the sigma of the hand's rotation per axis in degrees, 0 or more"
     )
+    estimate: list[Literal["hand_translation_mm", "hand_rotation_deg"]] = Field(
+        [], description=f"a list out of {', '.join(HAND_KEYS)}, which nobody knows"
+    )
 
 
 class CaptureHead(Strict):
@@ -121,7 +126,7 @@ class CaptureHead(Strict):
     )
     planes: list[Name] | None = Field(None, description="a list of names")
     noise: NoiseHead | None = Field(
-        None, description="a mapping {pixel, hand_translation_mm, hand_rotation_deg}"
+        None, description="a mapping {pixel, hand_translation_mm, hand_rotation_deg, estimate}"
     )
     known: dict[str, Any] = Field({}, description="a mapping from names to values")
 

@@ -41,7 +41,8 @@ class Rows:
     """What the tables of a capture say; arrays over its N rows.
 
     ``uv`` and ``cov_uv`` are NaN where nothing is given. ``verdict`` is "" where nothing was said
-    about a spot, ``used`` where its pixel is given, else why it must not be used.
+    about a spot, ``used`` where its pixel is given, else why it must not be used. ``stops``: as of
+    `Observations`, "" where a row has none; None without such a column.
     """
 
     ids: list[str]
@@ -55,6 +56,7 @@ class Rows:
     reason: list[str]
     warnings: list[str]
     has_spots: bool
+    stops: list[str] | None = None
 
 
 def read_rows(head: CaptureHead, folder: Path) -> Rows:
@@ -111,6 +113,7 @@ def rows_of(head: CaptureHead, poses: Table, spots: Table | None) -> Rows:
         reason=reason,
         warnings=warnings,
         has_spots=head.spots is not None or "u" in poses.columns,
+        stops=poses.columns.get("stop"),
     )
 
 

@@ -128,6 +128,8 @@ def _poses_table(
         names["camera"] = observations.camera
     if observations.lasers != (DEFAULT_LASER,):
         names["laser"] = observations.laser
+    if observations.stop is not None:
+        names["stop"] = observations.stop
     header = [*names, "x", "y", "z", *rotation_format(rotation).columns]
     columns = [position, angles]
     has_sigma = False

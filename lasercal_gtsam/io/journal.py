@@ -300,6 +300,7 @@ def observations_from(payload: Mapping[str, Any]) -> Observations:
             cov_uv=np.array(cov, dtype=np.float64).reshape(count, 2, 2),
             T_base_hand=np.array(payload["T_base_hand"], dtype=np.float64).reshape(count, 4, 4),
             image_size=payload["image_size"],
+            stop=payload.get("stop"),
             **{name: payload[name] for name in ("camera", "laser", "plane", "id")},
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:

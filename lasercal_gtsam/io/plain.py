@@ -94,6 +94,7 @@ def observations_to_dict(observations: Observations) -> dict[str, Any]:
         "uv": plain(observations.uv),
         "cov_uv": None if np.isnan(cov).all() else plain(cov),
         "T_base_hand": plain(observations.T_base_hand.reshape(count, 16)),
+        **({} if observations.stop is None else {"stop": observations.stop.tolist()}),
     }
 
 

@@ -60,6 +60,7 @@ class Bench:
     parts : (N, 2, 22) whitened derivative by each spot's own camera, laser and plane, per SI unit
     hand : (N, 2, 6) whitened derivative by the hand pose: translation in base, rotation in hand
     whitening : (N, 2, 2) ``W`` with ``W^T W`` the inverse covariance of a residual (1/px)
+    batch : the spots that were used, of all that there are
     A : (2 N + P, m) whitened derivative by the free coordinates, P rows of priors at the end
     r : (2 N + P,) whitened residuals, predicted minus seen
     group : (N,) labels of equal plane and hand orientation
@@ -76,6 +77,7 @@ class Bench:
     parts: Array
     hand: Array
     whitening: Array
+    batch: SpotBatch
     A: Array
     r: Array
     group: Index
@@ -132,7 +134,9 @@ class Bench:
 
     def columns(self, blocks: Array) -> Array:
         """(N, 2, k) whitened columns as (2 N + P, k): no prior knows of them."""
-        flat = blocks.reshape(2 * len(self), -1)
+        spread = np.zeros((len(self.batch), 2, blocks[0].size // 2))
+        spread[self.batch.used] = blocks.reshape(len(self), 2, -1)
+        flat = self.batch.decorrelated(spread)[self.batch.used].reshape(2 * len(self), -1)
         return np.concatenate([flat, np.zeros((len(self.r) - len(flat), flat.shape[1]))])
 
 
@@ -148,7 +152,7 @@ def lay_out(calibration: Calibration) -> Bench:
         There are no sigmas to judge by (as many unknowns as measurements), or no spot can be where
         the estimate has it.
     """
-    seen, options = calibration.inputs.observations, calibration.inputs.options
+    seen, options = calibration.inputs.observations, calibration.options_used
     fit = calibration.fit
     if not (calibration.spots.weight > 0).any():
         raise DataError("the calibration does not hold its spots: there are no residuals to judge")
@@ -178,7 +182,8 @@ def lay_out(calibration: Calibration) -> Bench:
             "some spots cannot be where the estimate has them (behind the camera, or the beam "
             "misses the plane): the calibration is not one"
         )
-    A, r = _system(problem, rows, np.einsum("nij,nj->ni", W, residual), used)
+    batch = batch.weighted(calibration.spots.weight > 0)
+    A, r = _system(problem, rows, np.einsum("nij,nj->ni", W, residual), batch)
     kept, hands = seen[used], np.array(seen.T_base_hand[used])
     hands[:, :3, 3] += eta[used, :3]
     if eta.any():
@@ -192,6 +197,7 @@ def lay_out(calibration: Calibration) -> Bench:
         parts=rows[used],
         hand=(W @ B)[used],
         whitening=W[used],
+        batch=batch,
         A=A,
         r=r,
         group=orientation_groups(kept, options),
@@ -213,8 +219,8 @@ def orientation_groups(
 
 def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, Array, float]:
     """Spots with their whole covariance; it, the hand's derivative, corrections, and the scale."""
-    seen, options = calibration.inputs.observations, calibration.inputs.options
-    noise = HandNoise(options.hand_sigma_m, options.hand_sigma_rad)
+    seen, options = calibration.inputs.observations, calibration.options_used
+    noise = HandNoise.of(options)
     unit = calibration.fit.sigma0
     eta = np.zeros((len(seen), 6))
     if not noise.variances.any():
@@ -228,15 +234,21 @@ def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, A
         cov = pixel_covariances(seen, options.sigma_px)
     for _ in range(_HAND_ROUNDS):
         B, free = linearized(seen, cell, eta)
-        eta = corrections(B, free, cov, noise)
-        eta[calibration.spots.weight <= 0] = 0.0
+        aside = calibration.spots.weight <= 0
+        eta = corrections(B, free, cov, noise, seen.shared_stops, aside)
     B, _ = linearized(seen, cell, eta)
     S = cov + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
     return corrected_batch(seen, cov, cell, noise, eta), S, B, eta, unit
 
 
-def _system(problem: CellGraph, rows: Array, residual: Array, used: Index) -> tuple[Array, Array]:
-    """Rows of spots and priors over the free coordinates, and their residuals."""
+def _system(
+    problem: CellGraph, rows: Array, residual: Array, batch: SpotBatch
+) -> tuple[Array, Array]:
+    """Rows of spots and priors over the free coordinates, and their residuals.
+
+    Those of spots that share an error of the hand are made independent.
+    """
+    used = batch.used
     cell, n = problem.start, problem.chart.n
     sizes = (len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT))
     lasers = sizes[0] * len(cell.cameras)
@@ -251,7 +263,8 @@ def _system(problem: CellGraph, rows: Array, residual: Array, used: Index) -> tu
             ]
         )
         full[members[:, None, None], np.arange(2)[:, None], at] = rows[members]
-    A, r = full[used].reshape(-1, n), residual[used].ravel()
+    A = batch.decorrelated(full)[used].reshape(-1, n)
+    r = batch.decorrelated(residual[..., None])[used].ravel()
     if problem.holds.priors:
         factor = prior_factor(problem.chart, problem.holds, cell)
         linear = factor.linearize(problem.start_values())
@@ -260,7 +273,7 @@ def _system(problem: CellGraph, rows: Array, residual: Array, used: Index) -> tu
     for c, aspect in enumerate(problem.chart.aspects):
         if aspect is not None:  # fv is free and takes fu along
             fu = c * sizes[0] + CAMERA_TANGENT.index("fu")
-            A[: 2 * len(used), fu + 1] += aspect * A[: 2 * len(used), fu]
+            A[: 2 * used.sum(), fu + 1] += aspect * A[: 2 * used.sum(), fu]
     return A[:, problem.free], r
 
 

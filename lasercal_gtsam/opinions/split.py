@@ -83,7 +83,7 @@ def fit_halves(calibration: Calibration) -> tuple[Calibration, Calibration]:
     SolveError
         A half cannot be calibrated; the message says which, and why.
     """
-    seen, options = calibration.inputs.observations, calibration.inputs.options
+    seen, options = calibration.inputs.observations, calibration.options_used
     if not (calibration.spots.weight > 0).any():
         raise SolveError("the calibration does not hold its spots, so there are no halves of them")
     # outliers were told apart by all the spots; half of them might disagree about that

@@ -5,11 +5,18 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
+from lasercal_gtsam.units import DEG_PER_RAD, MM_PER_M
+
 if TYPE_CHECKING:
-    from lasercal_gtsam.calibration import Calibration
+    from lasercal_gtsam.calibration import Calibration, NoiseLevel
 
 # residuals this many times larger than the stated noise deserve a word
 _SUSPICIOUS = 1.5
+_LEVELS = {
+    "sigma_px": ("pixels", 1.0, "px"),
+    "hand_sigma_m": ("hand position", MM_PER_M, "mm"),
+    "hand_sigma_rad": ("hand rotation", DEG_PER_RAD, "deg"),
+}
 
 
 def noise_sentence(calibration: Calibration) -> str:
@@ -23,6 +30,11 @@ def noise_sentence(calibration: Calibration) -> str:
     pixels_stated = (
         options.sigma_px is not None or not np.isnan(calibration.inputs.observations.cov_uv).all()
     )
+    if fit.noise:
+        return (
+            f"Noise from the residuals (95 % intervals, {behind}): "
+            f"{', '.join(map(_level_words, fit.noise))}."
+        )
     hand_stated = options.hand_sigma_m > 0 or options.hand_sigma_rad > 0
     if not (pixels_stated or hand_stated):
         return f"Noise of a pixel coordinate, from the residuals: {fit.sigma0:.3g} px ({behind})."
@@ -34,6 +46,13 @@ def noise_sentence(calibration: Calibration) -> str:
             "widened by that factor."
         )
     return f"{text}; the sigmas are scaled by that factor."
+
+
+def _level_words(level: NoiseLevel) -> str:
+    """``hand translation 1.02 mm (0.9 to 1.1)``."""
+    what, factor, unit = _LEVELS[level.name]
+    low, high = (size_words(factor * x) for x in (level.low, level.high))
+    return f"{what} {size_words(factor * level.value)} {unit} ({low} to {high})"
 
 
 def count(number: int, noun: str) -> str:

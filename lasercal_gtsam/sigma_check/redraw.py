@@ -21,12 +21,13 @@ import numpy as np
 import numpy.typing as npt
 from lasercal_factors.batch import LossName
 
+from lasercal_gtsam.again import options_as_held, refuse_unfit
 from lasercal_gtsam.calibration import Calibration
-from lasercal_gtsam.cell import INTRINSIC_NAMES, Cell
+from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import pixel_covariances
-from lasercal_gtsam.holds import Holds, resolve_holds
+from lasercal_gtsam.holds import Holds
 from lasercal_gtsam.io.wording import some
 from lasercal_gtsam.losses import efficient_loss, loss_weights
 from lasercal_gtsam.observations import Observations
@@ -37,7 +38,6 @@ from lasercal_gtsam.report_map import (
     BeamChart,
     row_names,
     row_values,
-    tangent_labels,
 )
 from lasercal_gtsam.robust import rejection_length
 from lasercal_gtsam.simulate import Noise
@@ -104,14 +104,20 @@ class Redraw:
         rows, redrawn = np.arange(len(seen)), 0
         for _ in range(_MAX_REDRAWS):
             part = seen[rows]
-            exact = _seen_at(self.truth, part, self.hand.moved_hands(part.T_base_hand, rng))
+            hands = self.hand.moved_hands(part.T_base_hand, rng)
+            for members in part.shared_stops:  # one standing of the hand, one error
+                hands[members] = hands[members[:, :1]]
+            exact = _seen_at(self.truth, part, hands)
             z = rng.standard_normal((len(rows), 2))
             noise = np.einsum("nij,nj->ni", axes[rows], z)
             direction = z / np.linalg.norm(z, axis=1, keepdims=True)
             far = self.outliers[rows]
             noise[far] = (self.distance_px[rows, None] * direction)[far]
             uv[rows] = exact + noise
-            rows = rows[np.isnan(exact[:, 0])]
+            lost = np.isnan(exact[:, 0])
+            for members in part.shared_stops:
+                lost[members] = lost[members].any(axis=1, keepdims=True)
+            rows = rows[lost]
             if not len(rows):
                 break
             redrawn += len(rows)
@@ -146,7 +152,7 @@ def redraw_of(calibration: Calibration, from_data: bool) -> Redraw:
         The calibration is not to be trusted (an open alarm, not converged), states no sigmas, does
         not hold all its spots, or contradicts itself.
     """
-    _refuse_unfit(calibration)
+    refuse_unfit(calibration, "check-sigma")
     inputs, spots = calibration.inputs, calibration.spots
     used = np.array([reason is None for reason in spots.rejected], dtype=np.bool_)
     seen = inputs.observations[used]
@@ -156,13 +162,6 @@ def redraw_of(calibration: Calibration, from_data: bool) -> Redraw:
         {name: cell.lasers[name] for name in seen.lasers},
         {name: cell.planes[name] for name in seen.planes},
     )
-    if tangent_labels(truth) != calibration.labels:
-        alone = sorted(set(calibration.labels) - set(tangent_labels(truth)))
-        raise DataError(
-            "check-sigma: the covariance is not that of the parts that have spots"
-            + (f" ({alone[0]} has none)" if alone else "")
-            + "; calibrate anew"
-        )
     options, holds = _options_of(calibration, truth, seen, from_data)
     cov_uv, hand = _noise_of(calibration, seen)
     lost = np.isnan(_seen_at(truth, seen, seen.T_base_hand)[:, 0])
@@ -186,29 +185,8 @@ def redraw_of(calibration: Calibration, from_data: bool) -> Redraw:
     )
 
 
-def _refuse_unfit(calibration: Calibration) -> None:
-    fit, inputs = calibration.fit, calibration.inputs
-    if not fit.converged:
-        raise DataError(
-            f"check-sigma: the sigmas of an answer that is not to be trusted mean nothing: "
-            f"{fit.status}"
-        )
-    stored, counted = len(inputs.observations), fit.n_spots + fit.n_rejected
-    if stored < counted:
-        raise DataError(
-            f"check-sigma: the calibration holds {stored} of its {counted} spots; the others live "
-            "on as prior knowledge only, so that their geometry cannot be simulated. Check a "
-            "calibration made from all spots ('lasercal calibrate')"
-        )
-    if not (np.isfinite(fit.sigma0) and np.isfinite(calibration.covariance).all()):
-        raise DataError(
-            "check-sigma: the calibration states no sigmas (no degrees of freedom are left to "
-            "estimate the noise from); add spots"
-        )
-
-
 def _noise_of(calibration: Calibration, seen: Observations) -> tuple[Array, Noise]:
-    options, sigma0 = calibration.inputs.options, calibration.fit.sigma0
+    options, sigma0 = calibration.options_used, calibration.fit.sigma0
     missing = np.isnan(seen.cov_uv[:, 0, 0])
     hand = options.hand_sigma_m, options.hand_sigma_rad
     found = max(hand) > 0 and options.sigma_px is None and bool(missing.any())
@@ -238,39 +216,15 @@ def _options_of(
     calibration: Calibration, truth: Cell, seen: Observations, from_data: bool
 ) -> tuple[CalibrationOptions, Holds]:
     """Options that hold what the calibration held, each at its value there."""
-    options = calibration.inputs.options
-    if options.distortion == "auto":  # which terms were chosen is given, as the sigmas take it
-        options = replace(options, distortion="all")
-    kept = options.fixed
     if from_data:
-        kept = tuple(f for f in options.fixed if any(part in f for part in _NEEDS_START))
+        fixed = calibration.inputs.options.fixed
+        kept = tuple(f for f in fixed if any(part in f for part in _NEEDS_START))
         if kept:
             raise DataError(
                 f"check-sigma: {', '.join(kept)} was held at the value of a given start; without a "
                 "start (--from-data) it cannot be"
             )
-    stated = np.diag(calibration.covariance) == 0.0
-    holds = resolve_holds(seen, options, truth)
-    known, dropped = dict(options.known), set[str]()
-    for c, (name, camera) in enumerate(truth.cameras.items()):
-        for term in INTRINSIC_NAMES:
-            at = c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(term)
-            if stated[at] and (from_data or not holds.held[at]):
-                known[f"{name}.{term}"] = getattr(camera.intrinsics, term)
-                dropped |= {term, f"{name}.{term}"}
-    # a fit may have ended with fewer terms than it was asked for; priors on these have no meaning
-    priors = {k: v for k, v in options.priors.items() if k not in dropped}
-    options = replace(options, known=known, fixed=kept, priors=priors)
-    holds = resolve_holds(seen, options, truth)
-    wrong = np.flatnonzero(holds.held != stated)
-    if len(wrong):
-        label = calibration.labels[wrong[0]]
-        says = "holds it" if holds.held[wrong[0]] else "does not"
-        raise DataError(
-            f"check-sigma: by its covariance the calibration "
-            f"{'holds' if stated[wrong[0]] else 'estimates'} {label}, by its options it {says}; "
-            "calibrate anew"
-        )
+    options, holds = options_as_held(calibration, truth, seen, "check-sigma", not from_data)
     return replace(options, priors=dict(holds.priors)), holds
 
 
