@@ -91,7 +91,7 @@ def closed_form_candidates(
         The data cannot give the cell; the message names what is missing and what would supply it.
     """
     known = {
-        camera: _known(
+        camera: known_intrinsics(
             size,
             (principal_point or {}).get(camera),
             (skew or {}).get(camera),
@@ -144,7 +144,7 @@ def closed_form_candidates(
     return tuple(candidates)
 
 
-def _known(
+def known_intrinsics(
     size: tuple[int, int],
     principal_point: tuple[float, float] | None,
     skew: float | None,
