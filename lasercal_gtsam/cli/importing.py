@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
+from lasercal_gtsam.cli.import_request import ImportRequest
 from lasercal_gtsam.cli.imported import report_lines, show_bag, summary
 from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.units import M_PER_MM, RAD_PER_DEG
 
 if TYPE_CHECKING:
     from lasercal_gtsam.recordings.bags import Bag
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from lasercal_gtsam.recordings.plan import Plan
     from lasercal_gtsam.recordings.planes import PlaneNames
     from lasercal_gtsam.recordings.sources import PictureSource
-    from lasercal_gtsam.recordings.stops import StillLimits
 
 _POSITIVE = click.FloatRange(min=0, min_open=True)
 
@@ -147,7 +146,7 @@ def import_recording(**given: Any) -> None:
     RECORDING is a ROS 1 or ROS 2 bag (.bag, .mcap, .db3 or a bag's folder; several for a bag that
     was split), or a folder of pictures named by their stamps, with --poses.
     """
-    ask = _Request(**given)
+    ask = ImportRequest(**given)
     ask.check()
     if ask.listing:
         _check_is_bag(ask.recording)
@@ -166,88 +165,6 @@ def import_recording(**given: Any) -> None:
 
 
 @dataclass(frozen=True)
-class _Request:
-    """The command line."""
-
-    recording: tuple[Path, ...]
-    output: Path | None
-    listing: bool
-    base: str | None
-    hand: str | None
-    pose_topic: str | None
-    images: tuple[str, ...]
-    poses: Path | None
-    pose_format: Literal["tum", "kalibr"] | None
-    transform: Literal["T_base_hand", "T_hand_base"] | None
-    names: Literal["auto", "s", "ms", "us", "ns", "order"]
-    plane: str | None
-    planes: Path | None
-    plane_topic: str | None
-    laser_topic: str | None
-    laser_on: bool
-    every_picture: bool
-    still_mm: float
-    still_deg: float
-    still_s: float
-    max_gap: float
-    image_offset: float
-    stamps: Literal["header", "received"]
-    dry_run: bool
-    force: bool
-    as_json: bool
-
-    def check(self) -> None:
-        """Raise `click.UsageError` for options that do not go together."""
-        if self.listing:
-            return
-        problems = []
-        if self.output is None and not self.dry_run:
-            problems.append("give -o/--output, or --dry-run to see what would be taken")
-        if sum(x is not None for x in (self.plane, self.planes, self.plane_topic)) != 1:
-            problems.append(
-                "which plane is worked on cannot be seen: give one of --plane, --planes and "
-                "--plane-topic"
-            )
-        if self.laser_topic and self.laser_on:
-            problems.append("give --laser-topic or --laser-on, not both")
-        if self.poses is not None:
-            if self.pose_format is None or self.transform is None:
-                problems.append("--poses needs --pose-format and --transform; none is assumed")
-            if len(self.recording) > 1:
-                problems.append("--poses goes with one folder of pictures")
-            of_bags = ("base", "hand", "pose_topic", "images", "plane_topic", "laser_topic")
-            problems += [
-                f"--{name.replace('_', '-')} is for bags, --poses for a folder of pictures"
-                for name in of_bags
-                if getattr(self, name)
-            ]
-        elif self.pose_topic is None and not (self.base and self.hand):
-            problems.append(
-                "give --base and --hand (frames; --list shows them) or --pose-topic for a bag, "
-                "--poses for a folder of pictures"
-            )
-        if problems:
-            raise click.UsageError("\n       ".join(problems))
-
-    @property
-    def offset_ns(self) -> int:
-        """What is added to the pictures' stamps."""
-        return round(self.image_offset * 1e9)
-
-    @property
-    def limits(self) -> StillLimits:
-        """When the hand stands still."""
-        from lasercal_gtsam.recordings.stops import StillLimits
-
-        return StillLimits(
-            move_m=self.still_mm * M_PER_MM,
-            turn_rad=self.still_deg * RAD_PER_DEG,
-            window_ns=max(round(self.still_s * 1e9), 1),
-            max_gap_ns=max(round(self.max_gap * 1e9), 1),
-        )
-
-
-@dataclass(frozen=True)
 class _Recorded:
     """What the recording gives."""
 
@@ -260,7 +177,7 @@ class _Recorded:
 
 
 @contextmanager
-def _opened(ask: _Request) -> Iterator[_Recorded]:
+def _opened(ask: ImportRequest) -> Iterator[_Recorded]:
     if ask.poses is not None:
         yield _from_folder(ask, ask.poses)
         return
@@ -284,7 +201,7 @@ def _check_is_bag(paths: Sequence[Path]) -> None:
             )
 
 
-def _from_folder(ask: _Request, poses: Path) -> _Recorded:
+def _from_folder(ask: ImportRequest, poses: Path) -> _Recorded:
     from lasercal_gtsam.recordings.picture_folder import open_folder
     from lasercal_gtsam.recordings.pose_files import read_pose_file
 
@@ -308,7 +225,7 @@ def _from_folder(ask: _Request, poses: Path) -> _Recorded:
     return _Recorded(motion, (source,), _planes(ask, None, motion, [source]), laser, about, ())
 
 
-def _from_bag(ask: _Request, bag: Bag) -> _Recorded:
+def _from_bag(ask: ImportRequest, bag: Bag) -> _Recorded:
     from lasercal_gtsam.recordings.bags import clock_notes
 
     if ask.pose_topic is not None:
@@ -339,7 +256,7 @@ def _from_bag(ask: _Request, bag: Bag) -> _Recorded:
     )
 
 
-def _image_topics(ask: _Request, bag: Bag) -> dict[str, str]:
+def _image_topics(ask: ImportRequest, bag: Bag) -> dict[str, str]:
     """Camera name to topic."""
     from lasercal_gtsam.recordings.bags import IMAGE_TYPES
 
@@ -367,7 +284,7 @@ def _image_topics(ask: _Request, bag: Bag) -> dict[str, str]:
 
 
 def _planes(
-    ask: _Request, bag: Bag | None, motion: Motion, sources: Sequence[PictureSource]
+    ask: ImportRequest, bag: Bag | None, motion: Motion, sources: Sequence[PictureSource]
 ) -> PlaneNames:
     from lasercal_gtsam.recordings.plan import origin_of
     from lasercal_gtsam.recordings.planes import LatchedPlanes, OnePlane, read_plane_intervals
@@ -380,7 +297,7 @@ def _planes(
     return LatchedPlanes(*bag.latched(str(ask.plane_topic), "String"))
 
 
-def _laser(ask: _Request, bag: Bag) -> LaserAt | Literal["see", "on"]:
+def _laser(ask: ImportRequest, bag: Bag) -> LaserAt | Literal["see", "on"]:
     if ask.laser_topic is None:
         return "on" if ask.laser_on else "see"
     from lasercal_gtsam.recordings.laser import latched_laser
@@ -388,7 +305,7 @@ def _laser(ask: _Request, bag: Bag) -> LaserAt | Literal["see", "on"]:
     return latched_laser(*bag.latched(ask.laser_topic, "Bool"))
 
 
-def _plan(ask: _Request, recorded: _Recorded, show: Any) -> Plan:
+def _plan(ask: ImportRequest, recorded: _Recorded, show: Any) -> Plan:
     from dataclasses import replace
 
     from lasercal_gtsam.recordings.plan import plan_capture
@@ -405,7 +322,7 @@ def _plan(ask: _Request, recorded: _Recorded, show: Any) -> Plan:
     return replace(plan, notes=(*recorded.notes, *plan.notes))
 
 
-def _write(ask: _Request, recorded: _Recorded, plan: Plan) -> None:
+def _write(ask: ImportRequest, recorded: _Recorded, plan: Plan) -> None:
     from lasercal_gtsam.recordings.write import write_recording
 
     assert ask.output is not None

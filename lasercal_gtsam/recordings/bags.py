@@ -13,7 +13,12 @@ import numpy as np
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.pictures import Picture
 from lasercal_gtsam.io.wording import did_you_mean, some
-from lasercal_gtsam.recordings.encodings import picture_from_compressed, picture_from_raw
+from lasercal_gtsam.recordings.messages import (
+    CameraInfo,
+    camera_info_of,
+    picture_of,
+    pose_numbers,
+)
 from lasercal_gtsam.recordings.motion import Motion, chain, pose_series
 from lasercal_gtsam.recordings.stamps import (
     NS_PER_S,
@@ -36,10 +41,11 @@ POSE_TYPES = (
 )
 CAMERA_INFO_TYPE = "sensor_msgs/msg/CameraInfo"
 _SUFFIXES = (".bag", ".mcap", ".db3")
-_MEND = (
-    "if the recording was cut off (a crash, a full disk), mend it first: 'rosbag reindex' for "
-    "ROS 1, 'ros2 bag reindex' for ROS 2, 'mcap recover' for .mcap"
-)
+_MENDING = {
+    ".bag": "'rosbag reindex'",
+    ".mcap": "'mcap recover cut.mcap -o mended.mcap'",
+    ".db3": "'sqlite3 cut.db3 .recover | sqlite3 mended.db3', then 'ros2 bag reindex'",
+}
 
 
 @dataclass(frozen=True)
@@ -51,18 +57,6 @@ class Topic:
     count: int
 
 
-@dataclass(frozen=True)
-class CameraInfo:
-    """What a ``camera_info`` topic says of a camera: shown to the user, never used unasked."""
-
-    topic: str
-    width: int
-    height: int
-    distortion_model: str
-    K: tuple[float, ...]
-    D: tuple[float, ...]
-
-
 def bag_files(path: Path) -> list[Path] | None:
     """Paths to hand to the reader for a bag, or None where ``path`` is no bag.
 
@@ -71,7 +65,7 @@ def bag_files(path: Path) -> list[Path] | None:
     """
     if path.is_file():
         if path.name.endswith(".bag.active"):
-            raise DataError(f"{path}: this recording was never closed; {_MEND}")
+            raise DataError(f"{path}: this recording was never closed; {_mend('.bag')}")
         return [path] if path.suffix in _SUFFIXES else None
     if (path / "metadata.yaml").is_file() and path.suffix != ".bag":
         return [path]
@@ -119,8 +113,8 @@ def open_bag(*paths: str | Path, clock: Clock = "header") -> Iterator[Bag]:
             store = get_typestore(Stores.ROS2_HUMBLE)
             reader = stack.enter_context(AnyReader(files, default_typestore=store))
         except Exception as error:  # whatever a damaged file makes the reader stumble over
-            raise _damaged(name, error) from None
-        yield Bag(name, reader, clock)
+            raise _damaged(name, files, error) from None
+        yield Bag(name, files, reader, clock)
 
 
 class Bag:
@@ -135,8 +129,9 @@ class Bag:
         topics read so far
     """
 
-    def __init__(self, name: str, reader: Any, clock: Clock) -> None:
+    def __init__(self, name: str, files: Sequence[Path], reader: Any, clock: Clock) -> None:
         self.name = name
+        self._files = tuple(files)
         self._reader = reader
         self._clock = clock
         self._transforms: TransformTree | None = None
@@ -220,7 +215,7 @@ class Bag:
             lags.append(received - stamps[-1])
             child = getattr(message, "child_frame_id", "").lstrip("/")
             frames.add((message.header.frame_id.lstrip("/"), child))
-            numbers.append(_pose_numbers(message))
+            numbers.append(pose_numbers(message))
         self._note_lag(topic, lags)
         wanted = (base or "").lstrip("/"), (hand or "").lstrip("/")
         problems = [
@@ -281,15 +276,7 @@ class Bag:
             topic = "/".join([*parts[:k], "camera_info"])
             if topic in self.of_types([CAMERA_INFO_TYPE]):
                 _, message = next(self._messages([topic]))
-                K, D = (getattr(message, n.lower(), getattr(message, n, ())) for n in "KD")
-                return CameraInfo(
-                    topic=topic,
-                    width=int(message.width),
-                    height=int(message.height),
-                    distortion_model=str(message.distortion_model),
-                    K=tuple(map(float, K)),
-                    D=tuple(map(float, D)),
-                )
+                return camera_info_of(topic, message)
         return None
 
     def camera_infos(self) -> dict[str, CameraInfo]:
@@ -309,7 +296,7 @@ class Bag:
             if which is None:
                 continue
             try:
-                yield which, _picture(message)
+                yield which, picture_of(message)
             except DataError as error:
                 at = f"{topic}, stamp {seconds_text(stamp)}"
                 raise DataError(*(f"{at}: {text}" for text in error.problems)) from None
@@ -329,7 +316,7 @@ class Bag:
             except StopIteration:
                 return
             except Exception as error:  # whatever a damaged file makes the reader stumble over
-                raise _damaged(self.name, error) from None
+                raise _damaged(self.name, self._files, error) from None
             yield int(received), message
 
     def _stamp(self, header: Any, received: int) -> int:
@@ -380,29 +367,13 @@ def clock_notes(lags: Mapping[str, float], images: Sequence[str]) -> list[str]:
     ]
 
 
-def _pose_numbers(message: Any) -> tuple[float, ...]:
-    """x, y, z, qx, qy, qz, qw of a pose or transform message."""
-    if hasattr(message, "transform"):
-        v, q = message.transform.translation, message.transform.rotation
-    else:
-        pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
-        v, q = pose.position, pose.orientation
-    return v.x, v.y, v.z, q.x, q.y, q.z, q.w
-
-
-def _picture(message: Any) -> Picture:
-    if hasattr(message, "format"):
-        return picture_from_compressed(message.data, str(message.format))
-    return picture_from_raw(
-        message.data,
-        height=int(message.height),
-        width=int(message.width),
-        step=int(message.step),
-        encoding=str(message.encoding),
-        big_endian=bool(message.is_bigendian),
-    )
-
-
-def _damaged(name: str, error: Exception) -> DataError:
+def _damaged(name: str, files: Sequence[Path], error: Exception) -> DataError:
     what = " ".join(str(error).split()) or type(error).__name__
-    return DataError(f"{name}: the bag cannot be read ({what}); {_MEND}")
+    inside = [p for file in files for p in (file.iterdir() if file.is_dir() else [file])]
+    kinds = [kind for kind in _MENDING if any(path.suffix == kind for path in inside)]
+    return DataError(f"{name}: the bag cannot be read ({what}); {_mend(*kinds)}")
+
+
+def _mend(*kinds: str) -> str:
+    ways = " or ".join(_MENDING[kind] for kind in kinds)
+    return f"if the recording was cut off (a crash, a full disk), mend it first: {ways}"

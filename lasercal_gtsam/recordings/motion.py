@@ -55,6 +55,12 @@ class PoseSeries(FrozenData):
         """Median time from one pose to the next, nanoseconds; infinite for a single pose."""
         return float(np.median(np.diff(self.stamps))) if len(self.stamps) > 1 else np.inf
 
+    def runs(self, max_gap: int) -> list[tuple[int, int]]:
+        """First and last stamps of the stretches without a gap of more than ``max_gap``."""
+        gaps = np.flatnonzero(np.diff(self.stamps) > max_gap)
+        firsts, lasts = np.r_[0, gaps + 1], np.r_[gaps, len(self.stamps) - 1]
+        return list(zip(self.stamps[firsts].tolist(), self.stamps[lasts].tolist(), strict=True))
+
     def at(self, stamps: Stamps, max_gap: int) -> tuple[Array, Known]:
         """Poses (M, 4, 4) at stamps (M,), and whether each is known; see `Motion.at`."""
         if self.fixed:
@@ -113,6 +119,21 @@ class Motion:
     def notes(self) -> tuple[str, ...]:
         """What was found odd in the series."""
         return tuple(note for series, _ in self.links for note in series.notes)
+
+    def runs(self, max_gap: int) -> list[tuple[int, int]]:
+        """Times (first, last) between which every link is known without a gap beyond ``max_gap``.
+
+        Runs of a single stamp are left out.
+        """
+        runs = [self.span]
+        for series in self.moving:
+            runs = [
+                (max(a, c), min(b, d))
+                for a, b in runs
+                for c, d in series.runs(max_gap)
+                if max(a, c) < min(b, d)
+            ]
+        return runs
 
     def at(self, stamps: Stamps, max_gap: int) -> tuple[Array, Known]:
         """Hand poses at given times.

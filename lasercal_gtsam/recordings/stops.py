@@ -9,12 +9,13 @@ import numpy as np
 
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.recordings.motion import Known, Motion
+from lasercal_gtsam.recordings.motion import Motion
 from lasercal_gtsam.recordings.stamps import NS_PER_S, Stamps, duration_text
 from lasercal_gtsam.rotations import rotation_log
 from lasercal_gtsam.units import DEG_PER_RAD, M_PER_MM, MM_PER_M, RAD_PER_DEG
 
 _SAMPLES = 30  # in a window
+_LONGEST_PERIOD = NS_PER_S // 100
 
 
 @dataclass(frozen=True)
@@ -55,38 +56,43 @@ class Stop:
 def find_stops(motion: Motion, limits: StillLimits) -> tuple[Stop, ...]:
     """Times at which the hand stands still, in order.
 
-    The pose is sampled 30 times in a window. How far it moves within a window is bounded from
-    above by the diagonal of the box about its positions, and how far it turns by that of the box
-    about its rotation matrices over sqrt(2) (two rotations an angle a apart are
+    The pose is sampled 30 times in a window, at least every 10 ms. How far it moves within a window
+    is bounded from above by the diagonal of the box about its positions, and how far it turns by
+    that of the box about its rotation matrices over sqrt(2) (two rotations an angle a apart are
     ``2 sqrt(2) sin(a/2)`` apart in the Frobenius norm).
 
     Raises
     ------
     DataError
-        The hand never stands still; the message says how close it came to it.
+        The poses are too few, or the hand never stands still; the message says how close it came.
     """
-    first, last = motion.span
-    period = max(limits.window_ns // _SAMPLES, 1)
-    half = limits.window_ns // (2 * period)
-    stamps = np.arange(first, last + 1, period, dtype=np.int64)
-    T, known = motion.at(stamps, limits.max_gap_ns)
-    _check_known(motion, known, limits)
-    if len(stamps) < 2 * half + 1:
-        raise DataError(
-            f"{motion.hand} in {motion.base} is known for {duration_text(last - first)} only; the "
-            f"hand must be seen to stand still for {duration_text(limits.window_ns)}"
-        )
-    moved = _diagonal(T[:, :3, 3], half)
-    turned = _diagonal(T[:, :3, :3].reshape(-1, 9), half) / np.sqrt(2)
-    whole = _everywhere(known, half)
-    still = whole & (moved <= limits.move_m) & (turned <= limits.turn_rad)
-    if not still.any():
-        raise _never_still(moved, turned, whole, limits)
-    edges = np.flatnonzero(np.diff(np.r_[False, still, False].astype(np.int8)))
-    return tuple(
-        Stop(int(stamps[start]), int(stamps[end - 1]))
-        for start, end in zip(edges[::2], edges[1::2], strict=True)
-    )
+    _check_often(motion, limits)
+    period = max(min(limits.window_ns // _SAMPLES, _LONGEST_PERIOD), 1)
+    half = -(-limits.window_ns // (2 * period))
+    stops: list[Stop] = []
+    quietest: tuple[float, float] | None = None
+    for first, last in motion.runs(limits.max_gap_ns):
+        stamps = np.arange(first, last + 1, period, dtype=np.int64)
+        if len(stamps) < 2 * half + 1:
+            continue
+        T, _ = motion.at(stamps, limits.max_gap_ns)
+        inner = slice(half, len(stamps) - half)  # whose windows lie within the run
+        moved = _diagonal(T[:, :3, 3], half)[inner]
+        turned = _diagonal(T[:, :3, :3].reshape(-1, 9), half)[inner] / np.sqrt(2)
+        still = (moved <= limits.move_m) & (turned <= limits.turn_rad)
+        edges = np.flatnonzero(np.diff(np.r_[False, still, False].astype(np.int8)))
+        times = stamps[inner]
+        stops += [
+            Stop(int(times[start]), int(times[end - 1]))
+            for start, end in zip(edges[::2], edges[1::2], strict=True)
+        ]
+        k = int(np.argmin(np.maximum(moved / limits.move_m, turned / limits.turn_rad)))
+        calm = float(moved[k]), float(turned[k])
+        if quietest is None or _excess(calm, limits) < _excess(quietest, limits):
+            quietest = calm
+    if not stops:
+        raise _never_still(motion, quietest, limits)
+    return tuple(stops)
 
 
 def stops_of_pictures(motion: Motion, stamps: Stamps, limits: StillLimits) -> tuple[Stop, ...]:
@@ -129,15 +135,21 @@ def split_stops(motion: Motion, stops: Sequence[Stop], limits: StillLimits) -> i
     )
 
 
-def _check_known(motion: Motion, known: Known, limits: StillLimits) -> None:
+def _check_often(motion: Motion, limits: StillLimits) -> None:
     """Refuse poses that come too seldom; single gaps are only times without a stop."""
-    if known.mean() > 0.5:
-        return
     slowest = max(motion.moving, key=lambda series: series.typical_gap)
+    if slowest.typical_gap <= limits.max_gap_ns:
+        return
+    what = (
+        f"its poses come every {duration_text(slowest.typical_gap)}"
+        if len(slowest.stamps) > 1
+        else "there is one pose only"
+    )
     raise DataError(
-        f"{slowest.name}: its poses come every {duration_text(slowest.typical_gap)}, and between "
-        f"poses more than {duration_text(limits.max_gap_ns)} apart nothing is assumed; allow more "
-        "(--max-gap) if the hand does not move unseen in between"
+        f"{slowest.name}: {what}, and between poses more than "
+        f"{duration_text(limits.max_gap_ns)} apart nothing is assumed; allow more (--max-gap) if "
+        "the hand does not move unseen in between, or give --every-picture if there is a pose for "
+        "each picture, taken at a standstill"
     )
 
 
@@ -150,26 +162,24 @@ def _diagonal(values: Array, half: int) -> Array:
     return np.asarray(np.linalg.norm(extent, axis=1))
 
 
-def _everywhere(known: Known, half: int) -> Known:
-    """Whether all is known within ``half`` samples; nothing is beyond the ends."""
-    from scipy.ndimage import minimum_filter1d
-
-    whole = minimum_filter1d(known.astype(np.uint8), 2 * half + 1, mode="constant", cval=0)
-    return np.asarray(whole > 0)
+def _excess(calm: tuple[float, float], limits: StillLimits) -> float:
+    return max(calm[0] / limits.move_m, calm[1] / limits.turn_rad)
 
 
-def _never_still(moved: Array, turned: Array, whole: Known, limits: StillLimits) -> DataError:
+def _never_still(
+    motion: Motion, quietest: tuple[float, float] | None, limits: StillLimits
+) -> DataError:
     window = duration_text(limits.window_ns)
-    if not whole.any():
+    if quietest is None:
         return DataError(
-            f"the poses have gaps of more than {duration_text(limits.max_gap_ns)} in every "
-            f"{window}: it cannot be seen where the hand stands still; allow more (--max-gap)"
+            f"{motion.hand} in {motion.base} is nowhere known for {window} without a gap of more "
+            f"than {duration_text(limits.max_gap_ns)}: it cannot be seen where the hand stands "
+            "still; allow longer gaps (--max-gap) or a shorter stop (--still-s)"
         )
-    excess = np.maximum(moved / limits.move_m, turned / limits.turn_rad)
-    k = int(np.flatnonzero(whole)[np.argmin(excess[whole])])
+    moved, turned = quietest
     return DataError(
         f"the hand never stands still: the least that it moves within {window} is "
-        f"{moved[k] * MM_PER_M:.3g} mm and {turned[k] * DEG_PER_RAD:.3g} deg, the limits are "
+        f"{moved * MM_PER_M:.3g} mm and {turned * DEG_PER_RAD:.3g} deg, the limits are "
         f"{limits.move_m * MM_PER_M:.3g} mm and {limits.turn_rad * DEG_PER_RAD:.3g} deg; raise "
         "them (--still-mm, --still-deg) if this is noise of the poses, or record with stops"
     )

@@ -57,6 +57,8 @@ class TransformTree:
     def motion(self, base: str, hand: str) -> Motion:
         """The motion of ``hand`` in ``base``.
 
+        A transform on /tf that never changes is as good as a static one, however rarely it comes.
+
         Raises
         ------
         DataError
@@ -137,9 +139,10 @@ class TransformTree:
         name = f"tf {parent} -> {child}"
         stamps = np.asarray(edge.stamps, dtype=np.int64)
         numbers = np.asarray(edge.numbers, dtype=np.float64).reshape(-1, 7)
-        if not edge.static:
+        same = bool((np.abs(numbers - numbers[0]) <= _STATIC_TOLERANCE).all())
+        if not edge.static and not same:
             return pose_series(name, stamps, numbers[:, :3], numbers[:, 3:], "quat_xyzw")
-        if (np.abs(numbers - numbers[0]) > _STATIC_TOLERANCE).any():
+        if not same:
             raise DataError(
                 f"{name}: this static transform changes in the recording; which value holds when "
                 "cannot be told. Make one recording for each"

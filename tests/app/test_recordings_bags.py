@@ -70,5 +70,9 @@ def test_laser_topic_says_what_the_pictures_show(laser, bags, capture, lasercal,
     assert outcome.status == 0, outcome.err
     found = load_capture(out)
     for k in range(len(capture)):
-        on, off = picture(found.images_on[k]), picture(found.images_off[k])
-        assert int(on.max()) - int(off.max()) > 20
+        for seen, state in ((found.images_on[k], "on"), (found.images_off[k], "off")):
+            distance = {
+                name: np.abs(picture(seen).astype(float) - picture(own)).max()
+                for name, own in (("on", capture.images_on[k]), ("off", capture.images_off[k]))
+            }
+            assert distance[state] < 0.2 * max(distance.values())
