@@ -31,14 +31,18 @@ _EXPORTS = {
     "Update": "incremental",
     "Verdict": "opinions",
     "calibrate": "api",
+    "export": "formats.export",
     "judge": "opinions",
     "check_sigma": "sigma_check.study",
     "load_calibration": "io.calibration_file",
     "load_capture": "io.capture",
+    "load_gtsam": "formats.gtsam_graph",
+    "load_intrinsics": "formats.intrinsics",
     "project": "projection",
     "spot_on_beam": "projection",
     "spot_on_ray": "projection",
     "spot_triangulated": "projection",
+    "to_gtsam": "formats.gtsam_graph",
 }
 
 __all__ = [
@@ -63,13 +67,17 @@ __all__ = [
     "__version__",
     "calibrate",
     "check_sigma",
+    "export",
     "judge",
     "load_calibration",
     "load_capture",
+    "load_gtsam",
+    "load_intrinsics",
     "project",
     "spot_on_beam",
     "spot_on_ray",
     "spot_triangulated",
+    "to_gtsam",
 ]
 
 if TYPE_CHECKING:
@@ -83,6 +91,9 @@ if TYPE_CHECKING:
         LasercalError,
         SolveError,
     )
+    from lasercal_gtsam.formats.export import export
+    from lasercal_gtsam.formats.gtsam_graph import load_gtsam, to_gtsam
+    from lasercal_gtsam.formats.intrinsics import load_intrinsics
     from lasercal_gtsam.incremental import IncrementalCalibrator, Update
     from lasercal_gtsam.io.calibration_file import load_calibration
     from lasercal_gtsam.io.capture import load_capture
