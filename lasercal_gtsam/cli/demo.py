@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from lasercal_gtsam.cli.calibrate import CALIBRATION_FILE, save
+from lasercal_gtsam.cli.calibrate import CALIBRATION_FILE, save, save_report
 from lasercal_gtsam.cli.console import json_option, print_json, progress, wrapped
 from lasercal_gtsam.cli.detect import SHEET_FILE, SPOTS_FILE, find_spots, save_sheet, save_spots
 from lasercal_gtsam.cli.outputs import capture_folder
+from lasercal_gtsam.cli.report import REPORT_FILE
 from lasercal_gtsam.cli.texts import account_lines, count, looked_at, result_lines
 from lasercal_gtsam.units import M_PER_MM, RAD_PER_DEG
 
@@ -34,6 +35,7 @@ _CONTENTS = {
     SPOTS_FILE: "what was found in each picture, or why nothing was",
     SHEET_FILE: "every spot enlarged, to be looked at",
     CALIBRATION_FILE: "the result with everything that made it",
+    REPORT_FILE: "the uncertainty report: open it in a browser",
     "truth.json": "the cell that the pictures were made of",
 }
 
@@ -74,6 +76,7 @@ def demo(out: Path, seed: int, force: bool, as_json: bool) -> int:
     observations = capture.observations(account=account)
     result = calibrate(observations, options=capture.options())
     save(result, out / CALIBRATION_FILE, capture)
+    save_report(result, out / REPORT_FILE, capture, account, out / CALIBRATION_FILE)
     rows = compare(result, load_truth(out))
     if as_json:
         print_json(_document(out, seed, result, rows, account))
@@ -144,7 +147,7 @@ def _take_pictures(out: Path, seed: int, force: bool) -> None:
         noise = Noise(0.0, HAND_MM * M_PER_MM, HAND_DEG * RAD_PER_DEG)
         made = simulate(PRESET, seed, noise)
         write_simulation(folder, made, spots=False, pictures=PictureOptions(), progress=show)
-    for name in (CALIBRATION_FILE, SPOTS_FILE, SHEET_FILE):  # of an earlier demo
+    for name in (CALIBRATION_FILE, REPORT_FILE, SPOTS_FILE, SHEET_FILE):  # of an earlier demo
         (out / name).unlink(missing_ok=True)
 
 
@@ -178,8 +181,8 @@ def _report(
         f"Everything is in {out}:",
         *(f"  {name:<18} {what}" for name, what in _CONTENTS.items()),
         wrapped(
-            f"Next: look at {SHEET_FILE}. 'lasercal calibrate {out}' does the last two steps from "
-            "the folder; for your own pictures and hand poses write a capture.yaml like this one."
+            f"Next: look at {REPORT_FILE} and {SHEET_FILE}. 'lasercal calibrate {out}' does the "
+            "last two steps from the folder; for your own pictures and hand poses write a capture.yaml like this one."
         ),
     ]
 

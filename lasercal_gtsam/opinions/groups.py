@@ -55,15 +55,16 @@ def leave_groups_out(bench: Bench) -> tuple[LeftOut, ...]:
         plane = str(bench.observations.plane[rows[0]])
         first = str(bench.observations.id[rows[0]])
         Q = bench.Q[at]
-        values, vectors = np.linalg.eigh(np.eye(len(at)) - Q @ Q.T)
+        # (I - Q Q^T)^-1 = I + Q (I - Q^T Q)^-1 Q^T, in the number of unknowns, not of spots
+        values, vectors = np.linalg.eigh(np.eye(Q.shape[1]) - Q.T @ Q)
         rest = bench.dof - len(at)
         if values[0] < _PREDICTED:
             nan = float("nan")
             found.append(LeftOut(first, plane, len(rows), nan, nan, nan, nan, nan))
             continue
-        cov = (vectors / values) @ vectors.T
+        root = Q @ vectors / np.sqrt(values)
         r = bench.residuals[at]
-        e = cov @ r
+        e = r + root @ (root.T @ r)
         chi2 = float(r @ e)
         chance = float("nan")
         if rest > 0:
@@ -73,8 +74,8 @@ def leave_groups_out(bench: Bench) -> tuple[LeftOut, ...]:
         to_plane[:, :2] = bench.by_point[rows]
         to_plane[:, 2] = bench.cell.planes[plane].normal_base
         to_mm = np.asarray(MM_PER_M * np.linalg.inv(to_plane)[:, :, :2], dtype=np.float64)
-        blocks = cov.reshape(len(rows), 2, len(rows), 2)
-        own = blocks[np.arange(len(rows)), :, np.arange(len(rows))]
+        parts = root.reshape(len(rows), 2, -1)
+        own = np.eye(2) + parts @ np.swapaxes(parts, 1, 2)
         errors = e.reshape(-1, 2, 1)
         found.append(
             LeftOut(
