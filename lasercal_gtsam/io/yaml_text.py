@@ -52,21 +52,22 @@ def parse_yaml(text: str, name: str) -> tuple[Any, Lines, list[tuple[Location, s
     """The same of a text; ``name`` is what messages call it."""
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
+    from ruamel.yaml.reader import ReaderError
 
     if len(text) > _MOST_CHARACTERS:
         raise DataError(f"{name}: {len(text)} characters; expected {_MOST_CHARACTERS} at most")
     try:
-        node = _plain_yaml(YAML).compose(text)
+        reader = YAML(typ="safe", pure=True)
+        reader.allow_duplicate_keys = True
+        node = reader.compose(text)
         if node is None:
             raise DataError(f"{name}: the file is empty")
         visit = _Visit(name)
         visit.node(node, ())
-        reader = _plain_yaml(YAML)
-        reader.allow_duplicate_keys = True
-        return reader.load(text), Lines(visit.lines), visit.problems
+        return reader.constructor.construct_document(node), Lines(visit.lines), visit.problems
     except RecursionError:
         raise DataError(f"{name}: {_TOO_DEEP}") from None
-    except (ValueError, ArithmeticError) as error:  # a date or a number that cannot be
+    except (ValueError, ArithmeticError, LookupError) as error:  # !!bool x, 2001-99-99
         raise DataError(f"{name}: not valid YAML: {error}") from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -74,8 +75,14 @@ def parse_yaml(text: str, name: str) -> tuple[Any, Lines, list[tuple[Location, s
         about = " ".join(part for part in (error.context, error.problem) if part)
         hint = _quoting_hint(text.splitlines()[mark.line : mark.line + 1] if mark else [])
         raise DataError(f"{name}{at}: not valid YAML: {about}{hint}") from None
+    except ReaderError as error:
+        line = text.count("\n", 0, error.position) + 1
+        raise DataError(
+            f"{name}:{line}: not valid YAML: the character U+{ord(text[error.position]):04X} "
+            "cannot be seen and is not allowed"
+        ) from None
     except YAMLError as error:
-        raise DataError(f"{name}: not valid YAML: {error}") from None
+        raise DataError(f"{name}: not valid YAML: {' '.join(str(error).split())}") from None
 
 
 def _quoting_hint(line: list[str]) -> str:
@@ -83,10 +90,6 @@ def _quoting_hint(line: list[str]) -> str:
     if line and re.search(r"\{(id|plane|camera|laser)\}", line[0]):
         return '; inside { } put a pattern in quotes: {on: "images/{id}.png"}'
     return ""
-
-
-def _plain_yaml(yaml_class: Any) -> Any:
-    return yaml_class(typ="safe", pure=True)
 
 
 _TOO_DEEP = f"lists or mappings inside each other, more than {_DEEPEST} deep"
