@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from lasercal_gtsam.closed_form.spots import Index, Spots
 from lasercal_gtsam.frozen import Array
@@ -33,6 +34,7 @@ class Groups:
     xy : (G, K, 2) scaled pixels
     t : (G, K, 3) hand positions, metres
     present : (G, K) 1 where there is a shot, 0 where the row is padding
+    rows : (G, K) number of each shot among the spots; -1 where the row is padding
     """
 
     R: Array
@@ -40,6 +42,7 @@ class Groups:
     xy: Array
     t: Array
     present: Array
+    rows: Index
 
     def __len__(self) -> int:
         return len(self.R)
@@ -53,7 +56,18 @@ class Groups:
             self.xy[which, :width],
             self.t[which, :width],
             self.present[which, :width],
+            self.rows[which, :width],
         )
+
+    def masked(self, kept: npt.NDArray[np.bool_]) -> Groups:
+        """The shots that are kept, (G, K); groups that are left with none stay, empty."""
+        order = np.argsort(~kept, axis=1, kind="stable")
+        row = np.arange(len(self))[:, None]
+        xy, t, rows = self.xy[row, order], self.t[row, order], self.rows[row, order]
+        there = np.take_along_axis(kept, order, axis=1)
+        every = np.arange(len(self))
+        packed = Groups(self.R, self.plane, xy, t, there.astype(np.float64), np.where(there, rows, -1))
+        return packed.subset(every)
 
     @property
     def shots(self) -> Index:
@@ -120,13 +134,14 @@ def find_groups(spots: Spots, tolerance_rad: float = GROUP_TOLERANCE_RAD) -> Gro
     width = max((len(rows) for rows in members), default=0)
     xy, t = np.zeros((len(members), width, 2)), np.zeros((len(members), width, 3))
     present = np.zeros((len(members), width))
+    numbers = np.full((len(members), width), -1, dtype=np.int64)
     R = np.zeros((len(members), 3, 3))
     for g, rows in enumerate(members):
         xy[g, : len(rows)], t[g, : len(rows)] = spots.xy[rows], spots.t[rows]
-        present[g, : len(rows)] = 1.0
+        present[g, : len(rows)], numbers[g, : len(rows)] = 1.0, rows
         R[g] = spots.R[rows].mean(axis=0)
     plane = np.array([spots.plane[rows[0]] for rows in members], dtype=np.int64)
-    return Groups(nearest_rotation(R) if len(R) else R, plane, xy, t, present)
+    return Groups(nearest_rotation(R) if len(R) else R, plane, xy, t, present, numbers)
 
 
 def thinned(

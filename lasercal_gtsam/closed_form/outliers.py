@@ -1,30 +1,66 @@
-"""A start that gross outliers do not spoil: solve, set aside what lies far off, solve again.
+"""A start that outliers do not spoil, be they one or nearly half of the spots.
 
-One reflection taken for the spot, 100 px away among 90, puts the closed form off by 15 %. Its
-residual still stands out, so it is found in a few rounds. Only the start leaves these spots out;
-the refinement gets all of them, and the names of those that were set aside.
+One reflection taken for the spot, 100 px away among 90, puts the closed form off by 15 %, and a
+fifth of them leaves nothing of it. So, once some spots stand out:
+
+1. the groups of non-rotating motions tell which of their shots agree (`agreement`);
+2. the pair is solved on those. One wrong spot among them still spoils it, so that parts of them are
+   tried as well, and the solution that most spots of all fit is taken;
+3. spots far off are set aside, those near are taken back, and the pair is solved again, until
+   nothing changes.
+
+Only the start leaves spots out; the refinement gets all of them, and the names of those that were
+set aside.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
+from lasercal_gtsam.closed_form.agreement import agreements
 from lasercal_gtsam.closed_form.camera import KnownIntrinsics
-from lasercal_gtsam.closed_form.groups import find_groups
-from lasercal_gtsam.closed_form.pair import PairCandidate, solve_pair
+from lasercal_gtsam.closed_form.groups import Groups, find_groups
+from lasercal_gtsam.closed_form.lost_planes import with_lost_planes
+from lasercal_gtsam.closed_form.pair import PairCandidate, plausible, solve_pair
+from lasercal_gtsam.closed_form.requirements import check_spots
 from lasercal_gtsam.closed_form.solution import Solution, spot_distances
-from lasercal_gtsam.closed_form.spots import Spots
+from lasercal_gtsam.closed_form.spots import Index, Spots
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.frozen import Array
+
+Mask = npt.NDArray[np.bool_]
 
 SUSPICIOUS = 4.5
 """Multiple of the median distance beyond which a spot starts the rounds (Gaussian: 5.3 sigma)."""
 ASIDE = 3.0
 """Multiple of the median distance beyond which spots are then left out (Gaussian: 3.5 sigma)."""
 SMALLEST_LIMIT_PX = 1.0
-MOST_ASIDE = 0.3
+MOST_ASIDE = 0.5
+FITS = 0.0125
+"""Share of the image diagonal within which a spot counts for a solution of a part of them."""
 _ROUNDS = 10
+# random parts of the spots that agree, the share of them, and the share of them that must fit a
+# solution for it to be good
+_AGREEMENTS, _PARTS, _PART_SHARE, _GOOD, _USABLE = 2, 10, 0.65, 0.8, 0.5
+# solutions of a part that are judged by all spots
+_JUDGED = 6
+
+
+class _Start(NamedTuple):
+    """Solutions of some spots, the best for all spots first.
+
+    ``distances`` (N,): of all spots from the best, pixels; ``rows``: the spots that were solved;
+    ``fit``: how many of all fit the best.
+    """
+
+    found: list[PairCandidate]
+    distances: Array
+    rows: Index
+    fit: float
 
 
 def solve_pair_without_outliers(
@@ -37,30 +73,29 @@ def solve_pair_without_outliers(
     DegenerateError
         As `pair.solve_pair` on all spots.
     """
-    found = solve_pair(spots, find_groups(spots, group_tolerance_rad), known)
-    distances = spot_distances(found[0].solution, spots)
-    kept = within(distances, SUSPICIOUS)
-    if kept.all():
-        return found
-    previous = np.ones(len(spots), dtype=bool)
-    for _ in range(_ROUNDS):
-        kept = within(distances, ASIDE)
-        if np.array_equal(kept, previous) or kept.mean() < 1.0 - MOST_ASIDE:
-            break
-        previous = kept
-        subset = spots.subset(np.flatnonzero(kept))
-        try:
-            again = solve_pair(subset, find_groups(subset, group_tolerance_rad), known)
-        except DegenerateError:
-            break
-        new = spot_distances(again[0].solution, spots)
-        if _median(new) > 1.02 * _median(distances):
-            break
-        found, distances = again, new
-    return found
+    check_spots(spots)
+    everything = np.arange(len(spots))
+    groups = find_groups(spots, group_tolerance_rad)
+    solver = _Solver(spots, known, group_tolerance_rad)
+    start = solver.solve(everything, search=False)
+    if start is not None and plausible(start.found[0], spots):
+        if within(start.distances, SUSPICIOUS).all():
+            return start.found
+    else:
+        start = None
+    agreed = solver.from_agreement(groups)
+    if agreed is None and start is None:
+        found = solve_pair(spots, groups, known)
+        start = _Start(found, spot_distances(found[0].solution, spots), everything, 0.0)
+        if within(start.distances, SUSPICIOUS).all():
+            return found
+    if start is None or (agreed is not None and agreed.fit > start.fit):
+        start = agreed
+    assert start is not None
+    return solver.rounds(start).found
 
 
-def set_aside(solution: Solution, spots: Spots) -> npt.NDArray[np.bool_]:
+def set_aside(solution: Solution, spots: Spots) -> Mask:
     """(N,) True for spots too far from a solution; none where no spot is `SUSPICIOUS`."""
     distances = spot_distances(solution, spots)
     if within(distances, SUSPICIOUS).all():
@@ -69,11 +104,89 @@ def set_aside(solution: Solution, spots: Spots) -> npt.NDArray[np.bool_]:
     return aside if aside.mean() <= MOST_ASIDE else np.zeros(len(spots), dtype=bool)
 
 
-def within(distances: Array, factor: float) -> npt.NDArray[np.bool_]:
-    """Spots nearer than a multiple of the median; NaN (spots on unsolved planes) counts as near."""
-    limit = max(factor * _median(distances), SMALLEST_LIMIT_PX)
+def within(distances: Array, factor: float, of: Array | None = None) -> Mask:
+    """Spots nearer than a multiple of the median; NaN (spots on unsolved planes) counts as near.
+
+    The median of all, or of the distances in ``of``.
+    """
+    limit = max(factor * _median(distances if of is None else of), SMALLEST_LIMIT_PX)
     return np.asarray(np.isnan(distances) | (distances <= limit))
 
 
 def _median(distances: Array) -> float:
     return float(np.nanmedian(distances))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solver:
+    """Solves parts of the spots of one pair, and judges the solutions by all of them."""
+
+    spots: Spots
+    known: KnownIntrinsics
+    group_tolerance_rad: float
+
+    def solve(self, rows: Index, *, search: bool) -> _Start | None:
+        """Solutions of some spots; None where these do not determine the cell."""
+        some = self.spots.subset(rows)
+        groups = find_groups(some, self.group_tolerance_rad)
+        try:
+            found = solve_pair(some, groups, self.known, search=search)
+        except DegenerateError:
+            return None
+        if len(rows) < len(self.spots):
+            found = [self.completed(one) for one in found[:_JUDGED]] + found[_JUDGED:]
+        distances = [spot_distances(one.solution, self.spots) for one in found[:_JUDGED]]
+        fits = [self.fit(one) for one in distances]
+        if len(rows) < len(self.spots):
+            best = int(np.argmax(fits))
+            found = [found[best], *found[:best], *found[best + 1 :]]
+        else:
+            best = 0
+        return _Start(found, distances[best], rows, fits[best])
+
+    def completed(self, candidate: PairCandidate) -> PairCandidate:
+        """The candidate with the planes that its spots did not give."""
+        solution = with_lost_planes(candidate.solution, self.spots, self.limit_px)
+        return replace(candidate, solution=solution)
+
+    @property
+    def limit_px(self) -> float:
+        """Distance up to which a spot counts for a solution."""
+        return FITS * float(np.hypot(*self.spots.image_size))
+
+    def fit(self, distances: Array) -> float:
+        """How many spots are near, those near the limit counting less."""
+        return float(np.nansum(np.maximum(0.0, 1.0 - (distances / self.limit_px) ** 2)))
+
+    def from_agreement(self, groups: Groups) -> _Start | None:
+        """The solution of shots that agree which most spots fit.
+
+        None where no part of the shots that agree has one that half as many spots fit.
+        """
+        rng = np.random.default_rng(0)
+        for agreement in agreements(groups)[:_AGREEMENTS]:
+            rows, best = agreement.rows, None
+            for trial in range(_PARTS):
+                share = 1.0 if trial == 0 else _PART_SHARE
+                part = np.sort(rng.permutation(rows)[: int(np.ceil(share * len(rows)))])
+                one = self.solve(part, search=False)
+                if one is not None and (best is None or one.fit > best.fit):
+                    best = one
+                if best is not None and best.fit > _GOOD * len(rows):
+                    return best
+            if best is not None and best.fit > _USABLE * len(rows):
+                return best
+        return None
+
+    def rounds(self, start: _Start) -> _Start:
+        """Set aside and take back spots until nothing changes."""
+        for _ in range(_ROUNDS):
+            kept = within(start.distances, ASIDE, start.distances[start.rows])
+            rows = np.flatnonzero(kept)
+            if np.array_equal(rows, start.rows) or kept.mean() < 1.0 - MOST_ASIDE:
+                break
+            again = self.solve(rows, search=True)
+            if again is None or _median(again.distances) > 1.02 * _median(start.distances):
+                break
+            start = again
+        return start

@@ -66,11 +66,13 @@ class PairCandidate:
         return self.rms_px + NEGATIVE_DEPTH_PENALTY_PX * self.negative
 
 
-def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[PairCandidate]:
+def solve_pair(
+    spots: Spots, groups: Groups, known: KnownIntrinsics, *, search: bool = True
+) -> list[PairCandidate]:
     """Closed-form solutions of one pair, best first.
 
     Directions come from the groups; where there are none, or where what they give is implausible,
-    from the search without groups.
+    from the search without groups, unless ``search`` is False.
 
     Raises
     ------
@@ -87,8 +89,7 @@ def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[Pai
     found += _ranked(
         solutions_from_beams(spots, planes, beams_from_directions(directions, planes), known), spots
     )
-    largest_rms_px = PLAUSIBLE_RMS * float(np.hypot(*spots.image_size))
-    if not any(c.negative <= PLAUSIBLE_NEGATIVE and c.rms_px <= largest_rms_px for c in found):
+    if search and not any(plausible(candidate, spots) for candidate in found):
         try:
             beams = [("search", u, q) for u, q in search_beams(planes)]
             found += _ranked(solutions_from_beams(spots, planes, beams, known), spots)
@@ -98,6 +99,12 @@ def solve_pair(spots: Spots, groups: Groups, known: KnownIntrinsics) -> list[Pai
         raise DegenerateError("no solution was found: " + "; ".join(dict.fromkeys(reasons)))
     found.sort(key=lambda candidate: candidate.rank)
     return found
+
+
+def plausible(candidate: PairCandidate, spots: Spots) -> bool:
+    """Whether nearly all spots are possible, and as near as strong distortion leaves them."""
+    largest_rms_px = PLAUSIBLE_RMS * float(np.hypot(*spots.image_size))
+    return candidate.negative <= PLAUSIBLE_NEGATIVE and candidate.rms_px <= largest_rms_px
 
 
 def solutions_from_groups(

@@ -130,8 +130,8 @@ def reprojection(solution: Solution, spots: Spots) -> tuple[float, float]:
 def _pixel_errors(solution: Solution, spots: Spots) -> tuple[Array, npt.NDArray[np.bool_]]:
     """Predicted minus seen pixels (N, 2), and which spots lie behind camera or beam (N,)."""
     X, length = spots_on_beams(solution, spots)
-    p = (X - solution.T) @ solution.R
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        p = (X - solution.T) @ solution.R
         image = p @ (spots.scaling @ solution.K).T
         error = (image[:, :2] / image[:, 2:] - spots.xy) / spots.scaling[0, 0]
     return np.asarray(error), ~((p[:, 2] > 0) & (length > 0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from closed_form_cases import beam_of, camera_of, exact, groups_of, noisy, spots_of, variant
@@ -19,7 +21,6 @@ from lasercal_gtsam.closed_form.direction import (
     tangent_bases,
     translation_map,
 )
-from lasercal_gtsam.closed_form.groups import Groups
 
 
 def angle(a: np.ndarray, b: np.ndarray) -> float:
@@ -103,7 +104,7 @@ def test_groups_without_information_are_left_out():
     flat[:3] -= flat[:3].mean(axis=1, keepdims=True)
     u0 = groups.R[0] @ beam_of(sim.truth)[0]
     flat[0] -= np.outer(flat[0] @ u0, u0)
-    planar = Groups(groups.R, groups.plane, groups.xy, flat, groups.present)
+    planar = replace(groups, t=flat)
     assert 0 not in informative_groups(planar)
     assert len(informative_groups(groups, shots=11)) == 0
     u, cost = robust_directions(groups.subset(np.array([], dtype=np.int64)))
@@ -116,9 +117,8 @@ def test_five_shots_a_group_are_enough_without_any_kernel():
     sim = variant(shots=7)
     groups = groups_of(sim)
     rows = np.array([0, 1, 2, 3, 6])  # the start and the ends span three directions
-    groups = Groups(
-        groups.R, groups.plane, groups.xy[:, rows], groups.t[:, rows], groups.present[:, rows]
-    )
+    parts = ("xy", "t", "present", "rows")
+    groups = replace(groups, **{name: getattr(groups, name)[:, rows] for name in parts})
     u, _ = robust_directions(groups)
     assert angle(u[0], beam_of(sim.truth)[0]) < 1e-7
 
