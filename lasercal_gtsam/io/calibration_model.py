@@ -8,7 +8,15 @@ from dataclasses import fields
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainValidator, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    model_validator,
+)
 
 from lasercal_gtsam.calibration import (
     Calibration,
@@ -66,7 +74,14 @@ def _array(*shape: int | None) -> Callable[[Any], Array]:
     return convert
 
 
+def _not_negative(value: float) -> float:
+    if value < 0:
+        raise ValueError(f"expected a sigma, 0 or more, got {value:g}")
+    return value
+
+
 Number = Annotated[float, BeforeValidator(_number)]
+Sigma = Annotated[float, BeforeValidator(_number), AfterValidator(_not_negative)]
 Vector2 = Annotated[Array, PlainValidator(_array(2))]
 Vector3 = Annotated[Array, PlainValidator(_array(3))]
 Vector4 = Annotated[Array, PlainValidator(_array(4))]
@@ -200,7 +215,7 @@ class ParameterModel(_Part):
     name: str
     initial: Number
     refined: Number
-    sigma: Number
+    sigma: Sigma
     unit: str
 
 

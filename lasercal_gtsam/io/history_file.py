@@ -19,7 +19,7 @@ from lasercal_gtsam.calibration import Calibration, Parameter
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.history import HistoryRow
 from lasercal_gtsam.io.files import read_text, write_text
-from lasercal_gtsam.io.wording import at_most
+from lasercal_gtsam.io.wording import at_most, quoted
 
 _FIRST, _LAST = ("spots", "rms_px", "sigma0"), "event"
 _SIGMA = "sigma_"
@@ -160,12 +160,12 @@ def _row(
     numbers = []
     for title, cell in zip(titles[:-1], cells, strict=False):
         try:
-            numbers.append(float(cell) if cell.strip() else math.nan)
-        except ValueError:
-            problems.append(f"{where}: {title}: expected a number, got {cell!r}")
+            numbers.append(_number(cell, title.startswith(_SIGMA)))
+        except ValueError as error:
+            problems.append(f"{where}: {title}: {error}, got {quoted(cell)}")
             numbers.append(math.nan)
     if not (math.isfinite(numbers[0]) and numbers[0] == int(numbers[0]) >= 0):
-        problems.append(f"{where}: spots: expected a whole number, got {cells[0]!r}")
+        problems.append(f"{where}: spots: expected a whole number, got {quoted(cells[0])}")
         numbers[0] = 0.0
     values, sigmas = numbers[len(_FIRST) :: 2], numbers[len(_FIRST) + 1 :: 2]
     return HistoryRow(
@@ -179,6 +179,21 @@ def _row(
         ),
         events=tuple(cells[-1].split(_BETWEEN)) if cells[-1] else (),
     )
+
+
+def _number(cell: str, is_sigma: bool) -> float:
+    """The number of a cell, NaN where it is empty; a sigma may be infinite, but not negative."""
+    if not cell.strip():
+        return math.nan
+    try:
+        number = float(cell)
+    except ValueError:
+        raise ValueError("expected a number") from None
+    if is_sigma and not number >= 0:
+        raise ValueError("expected a sigma, 0 or more")
+    if not (is_sigma or math.isfinite(number)):
+        raise ValueError("expected a finite number")
+    return number
 
 
 def _cell(value: float) -> str:

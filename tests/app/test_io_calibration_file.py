@@ -141,7 +141,7 @@ def test_any_float_survives(x: float, y: float) -> None:
     from lasercal_gtsam.io.calibration_model import CalibrationModel
 
     calibration = make(
-        parameters=(Parameter("fu", x, y, x, "px"),),
+        parameters=(Parameter("fu", x, y, abs(x), "px"),),
         covariance=np.array([[x, y], [y, 1.0]]),
         labels=("a", "b"),
     )
