@@ -24,10 +24,11 @@ from lasercal_gtsam import report_map
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.holds import Holds, check_prior_names
+from lasercal_gtsam.holds import Holds, check_prior_names, prior_charts
 from lasercal_gtsam.observations import Observations
-from lasercal_gtsam.report_map import CAMERA_TANGENT, BeamChart
+from lasercal_gtsam.report_map import CAMERA_TANGENT
 from lasercal_gtsam.rotations import make_pose
+from lasercal_gtsam.table_row import TableRow
 
 CELL_KEY = gtsam.symbol("z", 0)
 
@@ -250,61 +251,48 @@ def _ordered(cell: Cell, observations: Observations) -> Cell:
 
 def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFactor:
     """All priors as one factor: (row of the table - mean) / sigma; ``aspect`` by its logarithm."""
-    charts = {name: BeamChart.of(beam) for name, beam in start.lasers.items()}
-    rows = report_map.row_names(start, charts)
-    index = {name: i for i, (name, _) in enumerate(rows)}
     prefix = "{}." if len(start.cameras) > 1 else ""
     aspects = {f"{prefix.format(c)}aspect": i for i, c in enumerate(start.cameras)}
-    frames = beam_frames(start)
-    first_plane = chart.n - len(report_map.PLANE_TANGENT) * len(start.planes)
+    rows = {
+        name: TableRow.named(name, start, chart, prior_charts(name, start))
+        for name in holds.priors
+        if name not in aspects
+    }
     focal = len(CAMERA_TANGENT) * np.arange(len(start.cameras)) + CAMERA_TANGENT.index("fu")
-
-    def residual(cell: Cell) -> Array:
-        values = report_map.row_values(cell, charts)
-        intrinsics = [camera.intrinsics for camera in cell.cameras.values()]
-        e = np.empty(len(holds.priors))
-        for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
-            if name in aspects:
-                ratio = intrinsics[aspects[name]].fu / intrinsics[aspects[name]].fv
-                e[r] = np.log(ratio / mean) * mean / sigma
-                continue
-            difference = values[index[name]] - mean
-            if rows[index[name]][1] == "deg":
-                difference = (difference + 180.0) % 360.0 - 180.0
-            e[r] = difference / sigma
-        return e
+    held = holds.held.copy()
+    tied = [at for at, aspect in zip(focal, chart.aspects, strict=True) if aspect is not None]
+    held[tied] = True
 
     def error(values: Any) -> Array:
-        state = chart.state(values.atVector(CELL_KEY))
+        z = values.atVector(CELL_KEY)
+        state = chart.state(z)
+        e = np.full(len(holds.priors), np.inf)
         if not np.all(state.cam_K[:, :2] > 0):
-            return np.full(len(holds.priors), np.inf)
-        return residual(cell_from_state(state, start))
+            return e
+        for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
+            if name in rows:
+                e[r] = rows[name].difference(rows[name].value(z), mean) / sigma
+            else:
+                fu, fv = state.cam_K[aspects[name], :2]
+                e[r] = np.log(fu / fv / mean) * mean / sigma
+        return e
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         z = values.atVector(CELL_KEY)
         state = chart.state(z)
-        cell = cell_from_state(state, start)
-        F = report_map.row_jacobian(cell, charts, frames)
-        for i in range(len(start.planes)):
-            # at the normal as it stands: `Plane` turns it round where the distance is negative
-            block = slice(first_plane + 3 * i, first_plane + 3 * i + 3)
-            F[block, block] = report_map.plane_jacobian(state.plane_n[i], state.plane_d[i])
         J = np.zeros((len(holds.priors), chart.n))
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
-            if name in aspects:
+            if name in rows:
+                J[r] = rows[name].gradient(z) / sigma
+            else:
                 at = focal[aspects[name]]
                 fu, fv = state.cam_K[aspects[name], :2]
                 J[r, at : at + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
-            else:
-                J[r] = F[index[name]] / sigma
-        J = J @ chart.tangent_map(z)
-        held = holds.held.copy()
         for at, aspect in zip(focal, chart.aspects, strict=True):
             if aspect is not None:
                 J[:, at + 1] += aspect * J[:, at]
-                held[at] = True
         J[:, held] = 0.0
-        return residual(cell), [J]
+        return error(values), [J]
 
     noise = gtsam.noiseModel.Unit.Create(len(holds.priors))
     return custom_factor("priors", noise, [CELL_KEY], [chart.n], error, linearize)

@@ -27,6 +27,8 @@ ONE_PLANE_PRIORS: dict[str, tuple[float, float]] = {
     "p1": (0.0, 0.03),
     "p2": (0.0, 0.03),
 }
+# below this sine of its angle to the hand's z axis a beam's polar angle is rounding
+_LEAST_SIN_PHI = 1e-3
 
 
 @dataclass(frozen=True)
@@ -304,14 +306,33 @@ class _Builder:
             )
 
 
+def prior_charts(name: str, cell: Cell) -> dict[str, BeamChart]:
+    """How beams are written for a prior on that row: so that there is such a row, if possible.
+
+    The table writes a beam in the way that suits it, which may be another one for the start than
+    for the estimate; a prior keeps its meaning.
+    """
+    row = name.rpartition(".")[2]
+    return {laser: BeamChart.having(row, beam) for laser, beam in cell.lasers.items()}
+
+
 def check_prior_names(holds: Holds, cell: Cell) -> None:
-    """Raise `DataError` where a prior names no row of the table."""
-    charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
-    rows = [name for name, _ in table_rows(cell, charts)]
-    rows += [f"{c}.aspect" for c in cell.cameras] if len(cell.cameras) > 1 else ["aspect"]
+    """Raise `DataError` where a prior names no row of the table, or one that is not defined."""
+    aspects = [f"{c}.aspect" for c in cell.cameras] if len(cell.cameras) > 1 else ["aspect"]
     for name in holds.priors:
-        if name not in rows:
-            raise DataError(f"options.priors: unknown name {name!r}; allowed: {', '.join(rows)}")
+        charts = prior_charts(name, cell)
+        rows = [row for row, _ in table_rows(cell, charts)]
+        if name not in (*rows, *aspects):
+            allowed = ", ".join((*rows, *aspects))
+            raise DataError(f"options.priors: unknown name {name!r}; allowed: {allowed}")
+        for laser, beam in cell.lasers.items():
+            mine = len(cell.lasers) == 1 or name.startswith(f"{laser}.")
+            along = float(np.hypot(*beam.direction_hand[:2]))
+            if mine and name.endswith("laser_theta") and along < _LEAST_SIN_PHI:
+                raise DataError(
+                    f"options.priors: {name!r} is not defined for a beam along the hand's z axis; "
+                    "give laser_tilt_x and laser_tilt_y instead"
+                )
 
 
 def _known_terms(name: str, value: Any) -> dict[str, float]:

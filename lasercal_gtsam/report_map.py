@@ -61,6 +61,21 @@ class BeamChart:
         axis = 0 if u[0] >= MIN_CROSSING else int(np.argmax(u))
         return cls(bool(np.hypot(u[0], u[1]) >= MIN_SIN_PHI), axis)
 
+    @classmethod
+    def having(cls, row: str, beam: Beam) -> BeamChart:
+        """The chart of `of`, or the nearest one that has the row: what somebody named stays named.
+
+        Where no chart has it, that of `of`.
+        """
+        usual = cls.of(beam)
+        axes = [usual.axis, *np.argsort(-np.abs(beam.direction_hand)).tolist()]
+        for polar in (usual.polar, not usual.polar):
+            for axis in axes:
+                chart = cls(polar, axis)
+                if row in (name for name, _ in chart.rows):
+                    return chart
+        return usual
+
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Row names and units."""
