@@ -100,8 +100,8 @@ def _interval_words(dof: float, factor: float, distribution: str) -> str:
         else f"Student's t with {dof:.0f} degrees of freedom"
     )
     return (
-        f"95 % interval: refined +- {factor:.3g} sigma, by {name}. It covers noise, not a model "
-        "that is wrong."
+        f"95 % interval: refined \N{PLUS-MINUS SIGN} {factor:.3g} sigma, by {name}. It covers "
+        "noise, not a model that is wrong."
     )
 
 

@@ -241,7 +241,7 @@ def test_rectangles_cover_a_mask_and_nothing_twice(mask: Any) -> None:
 
 def test_map_shows_each_cell_in_the_colour_of_its_error() -> None:
     chart = document()["error_maps"]["maps"][0]
-    page = Page(str(error_map(chart)))
+    page = Page(str(error_map(chart, 0)))
     frame = [a for a in page.of("rect") if a.get("class") == "frame"][-1]
     left, top, wide, high = (float(frame[k] or 0) for k in ("x", "y", "width", "height"))
     values = np.array(chart["error_mm"], float)

@@ -61,6 +61,7 @@ def correlation_matrix(correlation: Mapping[str, Any]) -> Markup:
         title="Correlation of the estimated values",
         description=correlation["alt"],
         class_="correlation",
+        smallest=0.8,
     )
 
 

@@ -58,21 +58,22 @@ def plane_coverage(plane: Mapping[str, Any], index: int) -> Markup:
     )
 
 
-def error_map(chart: Mapping[str, Any]) -> Markup:
-    """The expected error of `locate` on a plane, one sigma in mm."""
+def error_map(chart: Mapping[str, Any], index: int) -> Markup:
+    """The expected error of `locate` on a plane, mm; ``index`` of the map on its page."""
     return _map(
         chart, chart["error_mm"], chart["contours"], "Expected error (mm)",
         f"Expected error on plane {chart['plane']}, camera {chart['camera']}", chart["alt"],
+        f"view-{index}",
     )  # fmt: skip
 
 
-def split_map(chart: Mapping[str, Any]) -> Markup:
+def split_map(chart: Mapping[str, Any], index: int) -> Markup:
     """How far two halves of the data put the same pixel apart, in the colours of `error_map`."""
     return _map(
         chart, chart["split"]["error_mm"], chart["split"]["contours"],
         "From split data (mm)",
         f"Error from split data on plane {chart['plane']}, camera {chart['camera']}",
-        chart["split_alt"],
+        chart["split_alt"], f"split-view-{index}",
     )  # fmt: skip
 
 
@@ -100,15 +101,20 @@ def _map(
     name: str,
     title: str,
     description: str,
+    view: str,
 ) -> Markup:
     x, y = np.array(chart["x_mm"], dtype=float), np.array(chart["y_mm"], dtype=float)
     values = np.array(field, dtype=float)
     low, high = chart["scale_mm"]
     corners = np.column_stack([_borders(x)[[0, -1]], _borders(y)[[0, -1]]])
     frame = plane_frame([corners], top=62.0, margin=0.0)
-    inside = list(_cells(frame, x, y, values, (low, high)))
-    lines, labels = _contours(frame, contours, (low, high))
-    inside.append(lines)
+    view_mm = np.array(chart["view_mm"], dtype=float).reshape(-1, 2)
+    lines, labels = _contours(frame, contours, (low, high), frame.at(view_mm))
+    inside = [*_cells(frame, x, y, values, (low, high)), lines]
+    if len(view_mm) > 2:
+        outline = path_through(frame.at(view_mm), closed=True)
+        clip = element("clipPath", element("path", d=outline), id=view)
+        inside = [clip, group(inside, clip_path=f"url(#{view})")]
     for points, classes in (("view_mm", ("seen",)), ("hull_mm", ("under", "hull"))):
         if len(chart[points]) > 2:
             line = path_through(frame.at(np.array(chart[points])), closed=True)
@@ -170,7 +176,7 @@ def _rectangles(mask: Mask) -> list[tuple[int, int, int, int]]:
 
 
 def _contours(
-    frame: Frame, contours: Sequence[Mapping[str, Any]], span: tuple[float, float]
+    frame: Frame, contours: Sequence[Mapping[str, Any]], span: tuple[float, float], view: Array
 ) -> tuple[Markup, Markup]:
     """Lines and, apart so that nothing covers them, labels."""
     lines, labels = [], []
@@ -181,7 +187,8 @@ def _contours(
         share = (contour["level_mm"] - span[0]) / max(span[1] - span[0], 1e-12)
         class_ = "contour on-dark" if share > 0.5 else "contour"
         lines += [element("path", d=path_through(line), class_=class_) for line in drawn]
-        longest = max(drawn, key=_length, default=None)
+        seen = [line[_within(line, view)] for line in drawn]
+        longest = max(seen, key=_length, default=None)
         if longest is not None and _length(longest) > _ROOM:
             place = _quiet_place(frame, longest, placed)
             placed.append(place)
@@ -203,6 +210,18 @@ def _quiet_place(frame: Frame, line: Array, placed: Sequence[Array]) -> Array:
     for other in placed:
         score += np.minimum(np.linalg.norm(line - other, axis=1), 44.0)
     return np.asarray(line[np.argmax(score)])
+
+
+def _within(points: Array, outline: Array) -> Mask:
+    """Which points (n, 2) a closed outline surrounds, by the parity of crossings; all if none."""
+    if len(outline) < 3:
+        return np.ones(len(points), dtype=bool)
+    a, b = outline[None], np.roll(outline, -1, axis=0)[None]
+    x, y = points[:, :1], points[:, 1:]
+    spans = (a[..., 1] > y) != (b[..., 1] > y)
+    height = np.where(a[..., 1] == b[..., 1], 1.0, b[..., 1] - a[..., 1])
+    crossing = a[..., 0] + (y - a[..., 1]) / height * (b[..., 0] - a[..., 0])
+    return np.asarray((spans & (x < crossing)).sum(axis=1) % 2 == 1)
 
 
 def _length(line: Array) -> float:

@@ -64,8 +64,12 @@ def drawing(
     title: str,
     description: str,
     class_: str = "",
+    smallest: float = 0.0,
 ) -> Markup:
-    """A whole figure: scales to its column, named and described for those who cannot see it."""
+    """A whole figure, named and described for those who cannot see it.
+
+    It scales down to its column, but not below the share ``smallest`` of its natural width.
+    """
     return element(
         "svg",
         element("title", title),
@@ -78,6 +82,7 @@ def drawing(
         role="img",
         aria_label=f"{title}. {description}",
         class_=f"drawing {class_}".rstrip(),
+        style=f"min-width:{smallest * width:.0f}px" if smallest else None,
     )
 
 
