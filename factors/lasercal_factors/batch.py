@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from lasercal_factors import kernels
+from lasercal_factors import hand_kernels, kernels
 from lasercal_factors.arrays import Array, Index, Spots, State
 from lasercal_factors.correlated import Correlation, Division, decorrelated
 from lasercal_factors.errors import FactorError
@@ -34,6 +34,13 @@ class Loss:
             raise FactorError(f"loss: one of {', '.join(LOSSES)}, threshold > 0; got {self}")
 
 
+class HandPrior(NamedTuple):
+    """Noise of hand poses: ``variances`` (6,), and ``fixed`` (N,) of the spots as they are held."""
+
+    variances: Array
+    fixed: npt.NDArray[np.bool_]
+
+
 @dataclass(frozen=True, eq=False)
 class SpotBatch:
     """Spots sorted into blocks of equal camera, laser and plane; build it with `from_arrays`.
@@ -44,12 +51,15 @@ class SpotBatch:
     order : (N,) input index of each spot held
     size : number of spots given (some may have been left out by `weighted`)
     correlations : groups of spots whose errors are not independent
+    hand : noise of the hand poses, which are eliminated wherever the batch is evaluated: see
+        `with_noisy_hands`
     """
 
     spots: Spots
     order: Index
     size: int
     correlations: tuple[Correlation, ...] = ()
+    hand: HandPrior | None = None
 
     @classmethod
     def from_arrays(
@@ -121,6 +131,47 @@ class SpotBatch:
         found = Correlation.of(groups, joint, whitening)
         return replace(self, correlations=(*self.correlations, found))
 
+    def with_noisy_hands(
+        self, variances: npt.ArrayLike, fixed: npt.ArrayLike | None = None
+    ) -> SpotBatch:
+        """The same with every hand pose an unknown, eliminated in closed form at each state.
+
+        What a state costs is then the least over all hand poses; residuals are those of the
+        commanded poses to first order about the likeliest, whitened with pixel and hand together.
+
+        Parameters
+        ----------
+        variances : (6,) of translation in the base (m^2) and rotation in the hand (rad^2)
+        fixed : (N,) booleans: spots, input order, judged at the commanded pose
+
+        Raises
+        ------
+        FactorError
+            On shapes that do not fit, a negative variance, or correlated spots.
+        """
+        hand = np.array(variances, dtype=np.float64)
+        mask = np.zeros(self.size, np.bool_) if fixed is None else np.array(fixed, np.bool_)
+        if hand.shape != (6,) or not np.all(hand >= 0) or mask.shape != (self.size,):
+            raise FactorError(
+                f"noisy hands: expected 6 variances >= 0 and ({self.size},) booleans, got {hand}, "
+                f"{mask.shape}"
+            )
+        if self.correlations:
+            raise FactorError("noisy hands: for spots that are correlated already")
+        return replace(self, hand=HandPrior(hand, mask[self.order]))
+
+    def at(self, state: State) -> SpotBatch:
+        """The batch with its hand poses corrected for a state, for which alone it is meant."""
+        if self.hand is None:
+            return self
+        return replace(self, spots=self._seen(state), hand=None)
+
+    def _seen(self, state: State) -> Spots:
+        if self.hand is None:
+            return self.spots
+        spots: Spots = hand_kernels.hands_corrected(self.spots, state, *self.hand)
+        return spots
+
     def __len__(self) -> int:
         return self.size
 
@@ -134,6 +185,8 @@ class SpotBatch:
             raise FactorError(f"weights: expected ({self.size},) numbers >= 0, got {given.shape}")
         weight = given[self.order]
         keep = weight > 0
+        if self.hand is not None and np.any(weight[keep] != 1):
+            raise FactorError("weights: other than 0 and 1 for spots with noisy hands")
         if not keep.any():
             raise FactorError("weights: every spot has weight zero")
         blocks = self.spots.blocks
@@ -142,13 +195,15 @@ class SpotBatch:
         pixels[2:] *= np.sqrt(weight[keep])
         spots = Spots(pixels, np.ascontiguousarray(self.spots.hands[:, keep]), _blocks(who[keep]))
         correlations = tuple(c.weighted(given) for c in self.correlations)
-        return SpotBatch(spots, self.order[keep], self.size, correlations)
+        hand = self.hand and HandPrior(self.hand.variances, self.hand.fixed[keep])
+        return SpotBatch(spots, self.order[keep], self.size, correlations, hand)
 
     def scaled(self, scale: float) -> SpotBatch:
-        """Return the same spots with every pixel sigma multiplied by ``scale``."""
+        """Return the same spots with every sigma multiplied by ``scale``."""
         pixels = self.spots.pixels.copy()
         pixels[2:] /= scale
-        return replace(self, spots=self.spots._replace(pixels=pixels))
+        hand = self.hand and self.hand._replace(variances=scale**2 * self.hand.variances)
+        return replace(self, spots=self.spots._replace(pixels=pixels), hand=hand)
 
     @cached_property
     def division(self) -> Division:
@@ -174,7 +229,7 @@ class SpotBatch:
     def residuals(self, state: State) -> Array:
         """Predicted minus seen pixel in input order, (N, 2); NaN where impossible or left out."""
         out = np.full((self.size, 2), np.nan)
-        out[self.order] = kernels.residuals(self.spots, state)
+        out[self.order] = kernels.residuals(self._seen(state), state)
         return out
 
     def whitened_lengths(self, state: State) -> Array:
@@ -182,8 +237,9 @@ class SpotBatch:
 
         Each spot by itself, whatever it has in common with others.
         """
-        du, dv = kernels.residuals(self.spots, state).T
-        w00, w01, w11 = self.spots.pixels[2:]
+        spots = self._seen(state)
+        du, dv = kernels.residuals(spots, state).T
+        w00, w01, w11 = spots.pixels[2:]
         out = np.full(self.size, np.nan)
         out[self.order] = np.hypot(w00 * du + w01 * dv, w11 * dv)
         return out
@@ -194,7 +250,7 @@ class SpotBatch:
         Each spot by itself; `decorrelated` makes correlated ones independent.
         """
         out = np.full((self.size, 2, kernels.COLUMNS), np.nan)
-        out[self.order] = kernels.rows(self.spots, state)
+        out[self.order] = kernels.rows(self._seen(state), state)
         return out
 
     def total_loss(self, state: State, loss: Loss) -> float:
@@ -202,14 +258,17 @@ class SpotBatch:
         if self.correlations:
             refuse_loss(loss)
             return self.division.total_loss(state)
-        return float(kernels.total_loss(self.spots, state, LOSSES[loss.name], loss.threshold))
+        return float(
+            kernels.total_loss(self._seen(state), state, LOSSES[loss.name], loss.threshold)
+        )
 
 
 def refuse_loss(loss: Loss) -> None:
-    """Raise `FactorError` where correlated spots are to be weighed one by one."""
+    """Raise `FactorError` where correlated spots, or noisy hands, are to be weighed by a loss."""
     if loss.name != "none":
         raise FactorError(
-            f"the {loss.name} loss weighs spots one by one; correlated spots have no such weight"
+            f"the {loss.name} loss weighs spots one by one as they are; not correlated ones, nor "
+            "those with noisy hands"
         )
 
 

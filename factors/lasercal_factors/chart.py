@@ -17,7 +17,7 @@ import gtsam
 import numpy as np
 import numpy.typing as npt
 
-from lasercal_factors import chart_kernels, kernels
+from lasercal_factors import chart_kernels, hand_kernels, kernels
 from lasercal_factors.arrays import Array, Index, State
 from lasercal_factors.batch import IMPOSSIBLE, LOSSES, Loss, SpotBatch, refuse_loss
 from lasercal_factors.errors import FactorError
@@ -123,9 +123,10 @@ def LaserCellFactor(
     robust = (LOSSES[loss.name], loss.threshold)
     constraints = (mask, tie_from, tie_from + 1, chart.aspect_array[tied])
     noise = gtsam.noiseModel.Unit.Create(n + 1)
-    if batch.correlations:
+    if batch.correlations or batch.hand is not None:
         refuse_loss(loss)
-        functions = _correlated(key, chart, batch, offsets, constraints)
+        pose = _correlated if batch.correlations else _noisy
+        functions = pose(key, chart, batch, offsets, constraints)
         return custom_factor("LaserCellFactor", noise, [key], [n], *functions)
 
     def error(values: Any) -> Array:
@@ -141,6 +142,29 @@ def LaserCellFactor(
         return R[:, n], [R[:, :n]]
 
     return custom_factor("LaserCellFactor", noise, [key], [n], error, linearize)
+
+
+def _noisy(
+    key: int, chart: CellChart, batch: SpotBatch, offsets: Index, constraints: tuple[Any, ...]
+) -> tuple[Error, Linearize]:
+    """Error and derivative of `LaserCellFactor` with the hand poses eliminated at every state."""
+    n = chart.n
+    variances, fixed = batch.hand or (np.zeros(6), np.ones(len(batch.order), np.bool_))
+    about = (chart.aspect_array, chart.reference, batch.spots, variances, fixed)
+
+    def error(values: Any) -> Array:
+        e = np.zeros(n + 1)
+        e[0] = math.sqrt(hand_kernels.loss_with_hands(values.atVector(key), *about))
+        return e
+
+    def linearize(values: Any) -> tuple[Array, list[Array]]:
+        z = values.atVector(key)
+        R = hand_kernels.root_with_hands(z, *about, offsets, constraints)
+        if not math.isfinite(R[0, 0]):
+            raise FactorError("LaserCellFactor: " + IMPOSSIBLE)
+        return R[:, n], [R[:, :n]]
+
+    return error, linearize
 
 
 def _correlated(

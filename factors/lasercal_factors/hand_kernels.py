@@ -10,11 +10,14 @@ import math
 
 import numpy as np
 
-from lasercal_factors.chart_kernels import rotation
-from lasercal_factors.kernels import jit
+from lasercal_factors.arrays import Spots
+from lasercal_factors.chart_kernels import move, rotation, square_root_information_at
+from lasercal_factors.kernels import jit, total_loss
 
 # corrections settle by a factor of 30 to 100 a round
 _HAND_ROUNDS = 2
+# corrections to the last digit: at most so many rounds, and when they stand still (sigmas)
+_MAX_ROUNDS, _SETTLED_SIGMAS = 12, 1e-10
 
 
 @jit
@@ -112,43 +115,78 @@ def correct_hands(spots, state, hand):
     """
     for block in spots.blocks:
         for k in range(block[3], block[4]):
-            c00, c01, c11 = covariance_of(
-                spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k]
-            )
-            commanded = spots.hands[:, k].copy()
-            eta, moved, at = np.zeros(6), commanded, commanded
-            last = (c00, c01, c11, 0.0, 0.0)
-            good = True
-            for _ in range(_HAND_ROUNDS + 1):
-                uv, B = by_hand(moved, block, state)
-                s00, s01, s11 = c00, c01, c11
-                r0, r1 = uv[0] - spots.pixels[0, k], uv[1] - spots.pixels[1, k]
-                for j in range(6):
-                    s00 += B[0, j] * hand[j] * B[0, j]
-                    s01 += B[0, j] * hand[j] * B[1, j]
-                    s11 += B[1, j] * hand[j] * B[1, j]
-                    r0 -= B[0, j] * eta[j]
-                    r1 -= B[1, j] * eta[j]
-                det = s00 * s11 - s01 * s01
-                good = math.isfinite(det) and math.isfinite(r0) and math.isfinite(r1)
-                if not good:
-                    break
-                shift0 = shift1 = 0.0
-                for j in range(6):
-                    shift0 += B[0, j] * eta[j]
-                    shift1 += B[1, j] * eta[j]
-                last = (s00, s01, s11, shift0, shift1)
-                at = moved
-                g0, g1 = (s11 * r0 - s01 * r1) / det, (s00 * r1 - s01 * r0) / det
-                eta = np.empty(6)
-                for j in range(6):
-                    eta[j] = -hand[j] * (B[0, j] * g0 + B[1, j] * g1)
-                moved = _moved_hand(commanded, eta)
-            if not good:
-                continue
-            s00, s01, s11, shift0, shift1 = last
-            spots.hands[:, k] = at
-            spots.pixels[0, k] += shift0
-            spots.pixels[1, k] += shift1
-            w00, w01, w11 = whitening_of(s00, s01, s11)
-            spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k] = w00, w01, w11
+            _correct(spots, k, block, state, hand, _HAND_ROUNDS, 0.0)
+
+
+@jit
+def hands_corrected(spots, state, hand, fixed):
+    """A copy of the spots with `correct_hands` done to the last digit, where not ``fixed`` (N,).
+
+    A fixed hand pose stays where it was commanded, its noise still counts.
+    """
+    moved = Spots(spots.pixels.copy(), spots.hands.copy(), spots.blocks)
+    for block in spots.blocks:
+        for k in range(block[3], block[4]):
+            rounds = 0 if fixed[k] else _MAX_ROUNDS
+            _correct(moved, k, block, state, hand, rounds, _SETTLED_SIGMAS)
+    return moved
+
+
+@jit
+def _correct(spots, k, block, state, hand, rounds, settled):
+    """Correct one hand pose; ends early once no part of ``eta`` moves by ``settled`` sigmas."""
+    c00, c01, c11 = covariance_of(spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k])
+    commanded = spots.hands[:, k].copy()
+    eta, moved, at = np.zeros(6), commanded, commanded
+    last = (c00, c01, c11, 0.0, 0.0)
+    for _ in range(rounds + 1):
+        uv, B = by_hand(moved, block, state)
+        s00, s01, s11 = c00, c01, c11
+        r0, r1 = uv[0] - spots.pixels[0, k], uv[1] - spots.pixels[1, k]
+        for j in range(6):
+            s00 += B[0, j] * hand[j] * B[0, j]
+            s01 += B[0, j] * hand[j] * B[1, j]
+            s11 += B[1, j] * hand[j] * B[1, j]
+            r0 -= B[0, j] * eta[j]
+            r1 -= B[1, j] * eta[j]
+        det = s00 * s11 - s01 * s01
+        if not (math.isfinite(det) and math.isfinite(r0) and math.isfinite(r1)):
+            return
+        shift0 = shift1 = 0.0
+        for j in range(6):
+            shift0 += B[0, j] * eta[j]
+            shift1 += B[1, j] * eta[j]
+        last = (s00, s01, s11, shift0, shift1)
+        at = moved
+        g0, g1 = (s11 * r0 - s01 * r1) / det, (s00 * r1 - s01 * r0) / det
+        still = True
+        before, eta = eta, np.empty(6)
+        for j in range(6):
+            eta[j] = -hand[j] * (B[0, j] * g0 + B[1, j] * g1)
+            still = still and abs(eta[j] - before[j]) <= settled * math.sqrt(hand[j])
+        if still:
+            break
+        moved = _moved_hand(commanded, eta)
+    s00, s01, s11, shift0, shift1 = last
+    spots.hands[:, k] = at
+    spots.pixels[0, k] += shift0
+    spots.pixels[1, k] += shift1
+    w00, w01, w11 = whitening_of(s00, s01, s11)
+    spots.pixels[2, k], spots.pixels[3, k], spots.pixels[4, k] = w00, w01, w11
+
+
+@jit
+def loss_with_hands(z, aspects, reference, spots, hand, fixed):
+    """Sum of squared whitened residuals at chart coordinates ``z``, hand poses eliminated there."""
+    state = move(z, aspects, reference)
+    return total_loss(hands_corrected(spots, state, hand, fixed), state, 0, 1.0)
+
+
+@jit
+def root_with_hands(z, aspects, reference, spots, hand, fixed, offsets, constraints):
+    """`chart_kernels.square_root_information_at` with the hand poses eliminated at ``z``.
+
+    The poses are where the error is least, so that its derivative is the one at fixed poses.
+    """
+    moved = hands_corrected(spots, move(z, aspects, reference), hand, fixed)
+    return square_root_information_at(z, aspects, reference, moved, offsets, 0, 1.0, constraints)

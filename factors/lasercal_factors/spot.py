@@ -191,6 +191,8 @@ def LaserSpotBatchFactor(
     mask = np.zeros(n, np.bool_) if held is None else np.array(held, np.bool_)
     if mask.shape != (n,):
         raise FactorError(f"held: expected ({n},) booleans, got {mask.shape}")
+    if batch.hand is not None:
+        raise FactorError("LaserSpotBatchFactor: noisy hands are for `LaserCellFactor`")
     if batch.correlations:
         refuse_loss(loss)
     none = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)

@@ -125,6 +125,27 @@ def corrected_batch(
     return batch
 
 
+def noisy_batch(
+    observations: Observations, cov_uv: Array, noise: HandNoise, aside: Mask
+) -> SpotBatch:
+    """Spots with independent hand poses, eliminated by the factor itself (`hand_kernels`).
+
+    Parameters
+    ----------
+    cov_uv : (N, 2, 2) px^2 of the pixels alone
+    aside : (N,) spots that are judged at the commanded pose
+    """
+    batch = SpotBatch.from_arrays(
+        observations.uv,
+        cov_uv,
+        observations.T_base_hand,
+        observations.camera_index,
+        observations.laser_index,
+        observations.plane_index,
+    )
+    return batch.with_noisy_hands(noise.variances, aside)
+
+
 def joint_derivative(B: Array, members: Index) -> Array:
     """``B`` (G, 2k, 6) of stops (G, k)."""
     return B[members].reshape(len(members), -1, B.shape[-1])

@@ -16,6 +16,7 @@ from lasercal_gtsam.hand_noise.elimination import (
     corrected_batch,
     corrections,
     linearized,
+    noisy_batch,
 )
 from lasercal_gtsam.hand_noise.levels import (
     Levels,
@@ -52,12 +53,14 @@ class Refined(NamedTuple):
 
 
 def refine_with_hand_noise(search: Search, solution: Solution, rejected: Mask) -> Refined:
-    """Refit with the robot's noise: rounds of corrected hand poses until nothing moves.
+    """Refit with the robot's noise.
 
-    Where spots have no pixel sigma (neither their own nor ``options.sigma_px``), it is found along
-    with the rest: the one with which the residuals are as long as they should be. Where
-    ``options.estimate_noise`` names levels of the hand, these and a missing pixel sigma are
-    estimated together, by restricted maximum likelihood (`components`).
+    Independent hand poses are eliminated inside the factor, at every state that the solver tries;
+    for shared ones there are rounds of corrected poses until nothing moves. Where spots have no
+    pixel sigma (neither their own nor ``options.sigma_px``), it is found along with the rest: the
+    one with which the residuals are as long as they should be. Where ``options.estimate_noise``
+    names levels of the hand, these and a missing pixel sigma are estimated together, by restricted
+    maximum likelihood (`components`).
 
     Parameters
     ----------
@@ -73,13 +76,15 @@ def refine_with_hand_noise(search: Search, solution: Solution, rejected: Mask) -
         Too few spots for the levels that were to be estimated.
     """
     observations, options = search.observations, search.options
-    pixels = PixelNoise.of(observations, options)
+    stops, pixels = observations.shared_stops, PixelNoise.of(observations, options)
     lacking = bool(pixels.missing.any())
     levels, change = Levels(1.0, HandNoise.of(options)), 0.0
+    in_rounds = bool(options.estimate_noise) or lacking or bool(stops)
     eta = np.zeros((len(observations), 6))
     for number in range(_MAX_ROUNDS_OF_LEVELS if options.estimate_noise else _MAX_ROUNDS):
-        B, r = linearized(observations, solution.cell, eta)
-        spots = Residuals(observations, eta, B, r, ~rejected)
+        if in_rounds:
+            B, r = linearized(observations, solution.cell, eta)
+            spots = Residuals(observations, eta, B, r, ~rejected)
         if options.estimate_noise:
             before, last = levels, levels if number else None
             levels = estimated_levels(spots, pixels, solution, options, last)
@@ -88,8 +93,12 @@ def refine_with_hand_noise(search: Search, solution: Solution, rejected: Mask) -
             dof = 2 * int((~rejected).sum()) - int(solution.problem.free.sum())
             levels = Levels(missing_sigma(spots, pixels, levels.hand, dof), levels.hand)
         cov = pixels.covariance(levels.sigma_px)
-        eta = corrections(B, r, cov, levels.hand, observations.shared_stops, rejected)
-        everyone = corrected_batch(observations, cov, solution.cell, levels.hand, eta)
+        if in_rounds:
+            eta = corrections(B, r, cov, levels.hand, stops, rejected)
+        if stops:
+            everyone = corrected_batch(observations, cov, solution.cell, levels.hand, eta)
+        else:
+            everyone = noisy_batch(observations, cov, levels.hand, rejected)
         batch = everyone.weighted(~rejected) if rejected.any() else everyone
         cost = batch.total_loss(state_from_cell(solution.cell), solution.problem.loss)
         better = replace(search, batch=batch).attempt(solution.cell, solution.problem.holds)
@@ -100,7 +109,7 @@ def refine_with_hand_noise(search: Search, solution: Solution, rejected: Mask) -
         unit = max(float(np.sqrt(better.cost / (2 * len(batch.order)))), _EXACT_PX)
         # where the solver itself comes near its optimum slowly, the rounds cannot do better
         near = max(_SETTLED_SIGMAS * unit, min(2.0 * better.decrement, CONVERGED_SIGMAS * unit))
-        if moved < near and change < _SETTLED_LEVELS:
+        if not in_rounds or (moved < near and change < _SETTLED_LEVELS):
             break
     else:
         what = "noise levels" if options.estimate_noise else "hand_sigma_m and hand_sigma_rad"
@@ -109,6 +118,10 @@ def refine_with_hand_noise(search: Search, solution: Solution, rejected: Mask) -
             f"sigma; check {what}"
         )
         solution = replace(solution, troubles=(*solution.troubles, trouble))
-    lengths = everyone.whitened_lengths(state_from_cell(solution.cell))
+    state = state_from_cell(solution.cell)
+    # from here on the spots are those at the likeliest hand poses
+    settled = replace(solution.problem, batch=batch.at(state))
+    solution = replace(solution, problem=settled)
+    lengths = everyone.whitened_lengths(state)
     lengths = np.where(np.isnan(lengths), np.inf, lengths)
     return Refined(solution, lengths, levels.sigma_px if lacking else None, levels)

@@ -5,7 +5,8 @@ noise only and both, the mean normalised squared error (NEES) of all unknowns to
 likelihood ratio of the truth (which does not care how the unknowns are written), and the spread of
 each row of the table. ``... components`` does so with the noise levels estimated along with the
 cell. ``... mixture`` compares the errors of f_u, R and T with those of least squares that knows
-nothing of the robot, over the noise levels of the paper's Figure 6.
+nothing of the robot, over the noise levels of the paper's Figure 6; ``... limit`` says what any
+unbiased estimate can gain there.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ from lasercal_factors.batch import Loss
 from scipy.stats import chi2, f
 
 import lasercal_gtsam as lc
-from lasercal_gtsam.graph import pixel_covariances, state_from_cell
+from lasercal_gtsam.graph import make_batch, pixel_covariances, spread_columns, state_from_cell
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
+from lasercal_gtsam.holds import resolve_holds
 from lasercal_gtsam.incremental.belief import coordinates
 from lasercal_gtsam.options import HAND_NOISE_NAMES
 from lasercal_gtsam.sigma_check.statistics import nees_check
@@ -213,6 +215,43 @@ def mixture(seeds: Sequence[int]) -> None:
     print_mixture("all levels (over level)", {w: np.concatenate(e) for w, e in total.items()})
 
 
+def limit(seeds: Sequence[int], level: float = 1.0) -> None:
+    """What stating the robot's noise can gain at most, by linear propagation.
+
+    With ``V`` the whole covariance of the pixels, least squares has ``(A^T A)^-1 A^T V A
+    (A^T A)^-1``, the best linear unbiased estimate ``(A^T V^-1 A)^-1``: the Cramer-Rao bound.
+    """
+    noise = Noise.table1(level)
+    hand = HandNoise(noise.hand_translation_m, noise.hand_rotation_rad)
+    options = lc.CalibrationOptions(distortion="none")
+    gains = []
+    for seed in seeds:
+        made = simulate("paper", seed)
+        seen, cell = made.observations, made.truth.restricted(made.observations)
+        B, _ = linearized(seen, cell, np.zeros((len(seen), 6)))
+        V = noise.pixel_px**2 * np.eye(2) + np.einsum("nij,j,nkj->nik", B, hand.variances, B)
+        rows = make_batch(seen, 1.0).rows(state_from_cell(cell))[..., :-1]
+        free = ~resolve_holds(seen, options, cell).held
+        A = spread_columns(rows, cell, seen)[..., free]
+        scale = np.linalg.norm(A, axis=(0, 1))
+        A = A / scale
+        plain = np.linalg.inv(np.einsum("nai,naj->ij", A, A))
+        spread = plain @ np.einsum("nai,nab,nbj->ij", A, V, A, optimize=True) @ plain
+        best = np.linalg.inv(np.einsum("nai,naj->ij", A, np.linalg.solve(V, A)))
+        parts = slice(6, 7), slice(0, 3), slice(3, 6)  # f_u, R, T
+        rms = [
+            [np.sqrt(np.sum((np.diag(P) / scale**2)[part])) for part in parts]
+            for P in (spread, best)
+        ]
+        gains.append(rms)
+    before, after = np.array(gains).transpose(1, 0, 2)
+    print(
+        f"level {level}: at most f_u, R, T less by "
+        f"{np.round(100 * (1 - after.mean(axis=0) / before.mean(axis=0)), 2)} % over {len(gains)} "
+        "captures"
+    )
+
+
 def print_mixture(title: str, errors: Mapping[str, np.ndarray]) -> None:
     """Mean errors and how far each way is below the first, with its standard error."""
     first = next(iter(errors.values()))
@@ -231,7 +270,7 @@ def print_mixture(title: str, errors: Mapping[str, np.ndarray]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("study", choices=["nees", "mixture", "components"])
+    parser.add_argument("study", choices=["nees", "mixture", "limit", "components"])
     parser.add_argument("--seeds", type=int, default=500)
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--groups", type=int)
@@ -242,6 +281,8 @@ def main() -> None:
     seeds = range(given.seeds)
     if given.study == "mixture":
         return mixture(seeds)
+    if given.study == "limit":
+        return limit(seeds)
     terms = given.distortion
     distortion = terms if terms in ("all", "none") else tuple(terms.split(","))
     shape = {k: v for k in ("groups", "shots") if (v := getattr(given, k)) is not None}
