@@ -30,8 +30,10 @@ _EXPORTS = {
     "SolveError": "errors",
     "Update": "incremental",
     "Verdict": "opinions",
+    "adjusted_hand_poses": "hand_noise.poses",
     "calibrate": "api",
     "export": "formats.export",
+    "hand_pose_graph": "hand_noise.explicit",
     "judge": "opinions",
     "check_sigma": "sigma_check.study",
     "load_calibration": "io.calibration_file",
@@ -65,9 +67,11 @@ __all__ = [
     "Update",
     "Verdict",
     "__version__",
+    "adjusted_hand_poses",
     "calibrate",
     "check_sigma",
     "export",
+    "hand_pose_graph",
     "judge",
     "load_calibration",
     "load_capture",
@@ -94,6 +98,8 @@ if TYPE_CHECKING:
     from lasercal_gtsam.formats.export import export
     from lasercal_gtsam.formats.gtsam_graph import load_gtsam, to_gtsam
     from lasercal_gtsam.formats.intrinsics import load_intrinsics
+    from lasercal_gtsam.hand_noise.explicit import hand_pose_graph
+    from lasercal_gtsam.hand_noise.poses import adjusted_hand_poses
     from lasercal_gtsam.incremental import IncrementalCalibrator, Update
     from lasercal_gtsam.io.calibration_file import load_calibration
     from lasercal_gtsam.io.capture import load_capture

@@ -16,6 +16,7 @@ _EXPORTS = {
     "LaserCellFactor": "chart",
     "LaserSpotBatchFactor": "spot",
     "LaserSpotFactor": "spot",
+    "LaserSpotHandFactor": "spot_hand",
     "LasercalError": "errors",
     "Loss": "batch",
     "SpotBatch": "batch",
@@ -33,6 +34,7 @@ __all__ = [
     "LaserCellFactor",
     "LaserSpotBatchFactor",
     "LaserSpotFactor",
+    "LaserSpotHandFactor",
     "LasercalError",
     "Loss",
     "SpotBatch",
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
         LaserSpotFactor,
         keys_for,
     )
+    from lasercal_factors.spot_hand import LaserSpotHandFactor
     from lasercal_factors.wrap import custom_factor
 
 
