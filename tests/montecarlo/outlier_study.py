@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 
@@ -119,23 +120,37 @@ def rms_sigmas(found: lc.Calibration, clean: lc.Calibration) -> float:
     return distance if np.isfinite(distance) else float("inf")
 
 
+def clean_optima(
+    seen: lc.Observations, truth: lc.Cell, options: lc.CalibrationOptions
+) -> list[lc.Calibration]:
+    """Least squares on clean spots, from the truth and from no start.
+
+    The two differ where the distortion has two minima that fit equally well (now and then, with 90
+    spots): either is what the clean spots give.
+    """
+    found = [lc.calibrate(seen, initial=truth, options=options)]
+    with suppress(lc.LasercalError):
+        found.append(lc.calibrate(seen, options=options))
+    return found
+
+
 def outcome_of(
     spots: int, share: float, kind: str, seed: int, options: lc.CalibrationOptions, sigma_px: float
 ) -> Outcome:
     """One capture, without a start, against least squares on its clean spots from the same."""
     seen, spoiled = plant(captured(spots, sigma_px, seed), share, kind, sigma_px, seed)
-    begin = time.perf_counter()
+    begin = time.process_time()
     try:
         found = lc.calibrate(seen, options=options)
     except lc.LasercalError as error:
         refusal = f"{type(error).__name__}: {str(error)[:90]}"
-        return Outcome(float("inf"), 0, 0, int(spoiled.sum()), False, 0.0, refusal)
-    seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
+        return Outcome(float("inf"), 0, 0, int(spoiled.sum()), False, seconds, refusal)
+    seconds = time.process_time() - begin
     named = np.array([reason is not None for reason in found.spots.rejected])
-    plain = replace(options, robust="none")
-    clean = lc.calibrate(seen[~spoiled], initial=_truth(spots, seed), options=plain)
+    optima = clean_optima(seen[~spoiled], _truth(spots, seed), replace(options, robust="none"))
     return Outcome(
-        rms_sigmas(found, clean),
+        min(rms_sigmas(found, clean) for clean in optima),
         int((named & spoiled).sum()),
         int((named & ~spoiled).sum()),
         int((~named & spoiled).sum()),
@@ -151,7 +166,7 @@ def outlier_study(
     seeds: Sequence[int],
     robust: str = "auto",
     sigma_px: float = 1.0,
-    distortion: str = "none",
+    distortion: str = "all",
 ) -> Tally:
     """Captures of the paper's cell with 90 or 900 spots, a share of them outliers of that kind."""
     options = lc.CalibrationOptions(robust=robust, distortion=distortion)
@@ -188,7 +203,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--pixel", type=float, default=1.0, help="px")
-    parser.add_argument("--distortion", default="none", choices=["all", "none"])
+    parser.add_argument("--distortion", default="all", choices=["all", "none"])
     parser.add_argument("--shares", type=float, nargs="+", default=SHARES)
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     given = parser.parse_args()
