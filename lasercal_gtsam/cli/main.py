@@ -26,6 +26,7 @@ from lasercal_gtsam.cli.importing import import_recording
 from lasercal_gtsam.cli.judge import judge
 from lasercal_gtsam.cli.report import report
 from lasercal_gtsam.cli.simulate import simulate
+from lasercal_gtsam.cli.study import study
 from lasercal_gtsam.cli.update import update
 from lasercal_gtsam.cli.watch import watch
 from lasercal_gtsam.errors import LasercalError
@@ -62,6 +63,7 @@ for _command in (
     history,
     export,
     simulate,
+    study,
     demo,
 ):
     cli.add_command(_command)

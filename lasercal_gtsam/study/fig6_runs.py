@@ -6,7 +6,8 @@ follow from the trial's number, so that the levels of a trial differ in the size
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -89,7 +90,9 @@ def fig6_run(spec: Mapping[str, Any], k: int) -> dict[str, list[float] | None]:
     wanted = set(spec["methods"])
     found: dict[str, Errors] = {}
     if wanted & set(METHODS[:6]):
-        found |= _laser(cell.simulated(seed, noise), wanted)
+        made = cell.simulated(seed, noise)
+        options = CalibrationOptions(robust="none", distortion="none", known=made.known)
+        found |= laser_errors(made, wanted, options)
     camera = cell.camera(seed)
     if wanted & {MA, MA_REFINED}:
         found |= _ma(camera, noise, stream(seed, _MA_STREAM))
@@ -106,35 +109,39 @@ def trial_seed(entropy: int, trial: int) -> int:
     return int(sequence.generate_state(1, np.uint64)[0])
 
 
-def _laser(made: Simulation, wanted: set[str]) -> dict[str, Errors]:
+def laser_errors(
+    made: Simulation, wanted: Collection[str], options: CalibrationOptions
+) -> dict[str, Errors]:
+    """Errors of the laser method's forms that are wanted, by name."""
     seen, truth = made.observations, made.truth
-    plain = CalibrationOptions(robust="none", distortion="none", known=made.known)
     found: dict[str, Errors] = {}
-    paper = _or_none(partial(closed_form, "paper", seen))
-    found[PAPER_CLOSED] = _errors(paper, truth)
+    paper: Cell | None = None
+    if {PAPER_CLOSED, REFINED_FROM_PAPER} & set(wanted):
+        paper = _or_none(partial(closed_form, "paper", seen))
+        found[PAPER_CLOSED] = _errors(paper, truth)
     for name, form in ((GENERAL, "general"), (TRIANGULATION, "triangulation")):
         if name in wanted:
             cell = _or_none(partial(closed_form, form, seen, made.known))
             found[name] = _errors(cell, truth)
-    refined = _refined(seen, plain, None)
-    found[REFINED] = _errors(refined, truth)
     if REFINED_FROM_PAPER in wanted:
-        start = None if paper is None else _refined(seen, plain, paper)
-        found[REFINED_FROM_PAPER] = _errors(start, truth)
+        found[REFINED_FROM_PAPER] = (
+            None if paper is None else _errors(_refined(seen, options, paper), truth)
+        )
+    refined: Cell | None = None
+    if {REFINED, HAND_NOISE} & set(wanted):
+        refined = _refined(seen, options, None)
+        found[REFINED] = _errors(refined, truth)
     if HAND_NOISE in wanted:
         noise = made.noise
-        if noise == Noise():
-            found[HAND_NOISE] = found[REFINED]
-        else:
-            known = CalibrationOptions(
-                robust="none",
-                distortion="none",
-                known=made.known,
+        if noise != Noise():
+            known = replace(
+                options,
                 sigma_px=noise.pixel_px,
                 hand_sigma_m=noise.hand_translation_m,
                 hand_sigma_rad=noise.hand_rotation_rad,
             )
-            found[HAND_NOISE] = _errors(_refined(seen, known, refined), truth)
+            refined = _refined(seen, known, refined)
+        found[HAND_NOISE] = _errors(refined, truth)
     return found
 
 
