@@ -27,7 +27,7 @@ def with_intrinsics(
     """Options with lenses held at what files say (``"known"``), or with priors on them.
 
     A prior is on each number for itself: what a file's covariance says of how they go together is
-    not used. Numbers without a sigma, in the file or in ``sigmas``, cannot have a prior; a number
+    not used. What the options hold already stays held. Numbers without a sigma, in the file or in ``sigmas``, cannot have a prior; a number
     that was held where the file was made (sigma 0) is held here. ``"start"`` changes no options:
     see `start_with_intrinsics`.
 
@@ -70,12 +70,17 @@ def with_intrinsics(
                 f"{', '.join(missing)} (--intrinsics-sigma NAME=SIGMA); or take it as known, or as "
                 "a start"
             )
+        stated = _stated(options, prefix)
+        if unused := [row for row, t in zip(ROWS, INTRINSIC_NAMES, strict=True) if t in stated]:
+            words.append(f"{lens.path}: {', '.join(unused)} not used: known already")
         for row, term in zip(ROWS, INTRINSIC_NAMES, strict=True):
+            if term in stated:
+                continue
             value = getattr(lens.intrinsics, "alpha_c" if row == "alpha_c" else term)
             if found[row] > 0:
                 priors.setdefault(prefix + row, (float(value), found[row]))
             else:
-                known.setdefault(prefix + term, float(getattr(lens.intrinsics, term)))
+                known[prefix + term] = float(getattr(lens.intrinsics, term))
         if lens.covariance is not None:
             words.append(
                 f"{lens.path}: the sigmas are used as priors, not how the numbers go together"
@@ -149,6 +154,13 @@ def check_given(observations: Observations, given: Mapping[str, KnownIntrinsics]
             )
     if problems:
         raise DataError(*problems)
+
+
+def _stated(options: CalibrationOptions, prefix: str) -> set[str]:
+    """Intrinsics of a camera that the options hold already."""
+    names = {name for name in INTRINSIC_NAMES if {name, prefix + name} & options.known.keys()}
+    pair = {"principal_point", prefix + "principal_point"} & options.known.keys()
+    return names | {"u0", "v0"} if pair else names
 
 
 def _prefix(observations: Observations, camera: str) -> str:

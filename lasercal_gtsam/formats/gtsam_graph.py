@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import gtsam
 import numpy as np
@@ -41,8 +42,10 @@ FORMAT = "lasercal-gtsam-prior"
 # What is held has no sigma, and a graph cannot have an infinite weight: its prior has this one,
 # in metres, radians and pixels. Much smaller ones lose the joint marginals to rounding.
 HELD_SIGMA = 1e-6
-# correlation along which nothing is free: tied focal lengths
-_NULL = 1e-12
+# Eigenvalue of the correlations below which nothing is free along a direction (tied focal lengths),
+# and the sigma it has instead, as a share of the sigmas of what is tied: enough to hold it, and not
+# so stiff that GTSAM's Cholesky decomposition fails.
+_NULL, TIED_SHARE = 1e-12, 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,10 +92,8 @@ class GtsamPrior:
         scale = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(scale, scale)
         found, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
-        # along a null direction a step of sigma 1 in `axes` is at most HELD_SIGMA in its own units
-        sigma = np.sqrt(np.maximum(found, 0.0))
-        for i in np.flatnonzero(found < _NULL * max(1.0, float(found[-1]))):
-            sigma[i] = HELD_SIGMA / float(np.abs(axes[:, i] * scale).max())
+        tied = found < _NULL * float(found[-1])
+        sigma = np.where(tied, TIED_SHARE, np.sqrt(np.abs(found)))
         return np.asarray((axes / sigma).T / scale)
 
     @property
@@ -102,7 +103,7 @@ class GtsamPrior:
         The error is the chart's coordinates about the mean: of a camera's pose rotation and
         translation apart, as `CellChart` has them, not the coupled logarithm of `Pose3`. Both have
         the same covariance; far from the mean they bend differently. What was held is pinned with
-        a sigma of `HELD_SIGMA` (also the ratio of tied focal lengths).
+        a sigma of `HELD_SIGMA`, what was tied with `TIED_SHARE` of its sigmas.
         """
         keys, chart, whiten = self.keys, CellChart(self.state), self.square_root_information
         signs = _signs(keys)
@@ -170,7 +171,7 @@ def load_gtsam(path: str | Path) -> GtsamPrior:
     """
     try:
         return _read(read_bytes(path))
-    except (ValueError, OSError, KeyError, DataError) as error:
+    except (ValueError, OSError, KeyError, EOFError, BadZipFile, DataError) as error:
         raise DataError(f"{path}: not a file of the format gtsam: {error}") from None
 
 

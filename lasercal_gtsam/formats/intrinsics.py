@@ -6,6 +6,7 @@ import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -86,8 +87,7 @@ def load_intrinsics(path: str | Path, camera: str | None = None) -> KnownIntrins
         return _from_json(text, name, camera)
     if start.startswith(("%YAML:1.0", "<?xml", "<opencv_storage")) or "opencv-matrix" in text:
         lens, size, covariance = opencv_storage.intrinsics_of(content, name)
-        stored = opencv_storage.opened(content, name).getNode("camera_name").string()
-        return KnownIntrinsics(lens, size, covariance, stored, "OpenCV FileStorage", name)
+        return KnownIntrinsics(lens, size, covariance, "", "OpenCV FileStorage", name)
     if "'lensmodel'" in text or "'lens_model'" in text or '"lensmodel"' in text:
         lens, size = mrcal_model.intrinsics_of(mrcal_model.fields_of(content, name))
         return KnownIntrinsics(lens, size, None, "", "mrcal cameramodel", name)
@@ -125,7 +125,7 @@ def _from_json(text: str, name: str, camera: str | None) -> KnownIntrinsics:
 def _from_npz(content: bytes, name: str, camera: str | None) -> KnownIntrinsics:
     try:
         held = plain_data.read_npz(content)
-    except (ValueError, KeyError, OSError, EOFError, DataError) as error:
+    except (ValueError, KeyError, OSError, EOFError, BadZipFile, DataError) as error:
         raise DataError(f"{name}: not an export of the format npz: {error}") from None
     cameras = {
         k: Camera(lens, held.poses[k], held.image_size[k]) for k, lens in held.intrinsics.items()

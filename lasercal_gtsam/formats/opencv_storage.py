@@ -72,26 +72,19 @@ def write_storage(source: Source) -> Written:
 
 def read_storage(content: bytes) -> Held:
     """Read with OpenCV what `write_storage` writes."""
-    import cv2
-
     storage = opened(content, "OpenCV file")
-    matrix = {key: storage.getNode(key) for key in ("covariance", "T_parent_child")}
     name, parent, child = (
         storage.getNode(key).string() for key in ("camera_name", "parent_frame", "child_frame")
     )
     labels = storage.getNode("covariance_labels")
     lens, size, covariance = intrinsics_of(content, "OpenCV file")
-    R, _ = cv2.Rodrigues(cv2.Rodrigues(matrix["T_parent_child"].mat()[:3, :3])[0])
-    T = matrix["T_parent_child"].mat()
-    if not np.abs(R - T[:3, :3]).max() < 1e-6:
-        raise DataError("OpenCV file: T_parent_child is no rigid transform")
     held = covariance is not None
     return Held(
-        poses={child: T},
+        poses={child: storage.getNode("T_parent_child").mat()},
         intrinsics={name: lens},
         image_size={} if size is None else {name: size},
         frames=(parent, child),
-        covariance=matrix["covariance"].mat() if held else None,
+        covariance=storage.getNode("covariance").mat() if held else None,
         labels=tuple(labels.at(i).string() for i in range(labels.size())) if held else (),
     )
 
@@ -154,9 +147,10 @@ def _covariance(storage: Any, name: str) -> Array | None:
     if labels.empty() or matrix.empty():
         return None
     found = tuple(labels.at(i).string() for i in range(labels.size()))
-    if found != CAMERA_TANGENT or matrix.mat() is None or matrix.mat().shape != (15, 15):
+    values = _mat(matrix)
+    if found != CAMERA_TANGENT or values is None or values.shape != (15, 15):
         raise DataError(f"{name}: covariance: expected 15 x 15 of {', '.join(CAMERA_TANGENT)}")
-    return np.asarray(matrix.mat()[6:, 6:], dtype=np.float64)
+    return np.asarray(values[6:, 6:], dtype=np.float64)
 
 
 def _size(storage: Any, name: str) -> tuple[int, int] | None:
@@ -170,12 +164,22 @@ def _size(storage: Any, name: str) -> tuple[int, int] | None:
     return int(width), int(height)
 
 
+def _mat(node: Any) -> Any:
+    """A node's matrix; None where it is none."""
+    import cv2
+
+    try:
+        return node.mat() if node.isMap() else None
+    except cv2.error:  # fewer numbers than rows and columns
+        return None
+
+
 def _matrix(storage: Any, keys: tuple[str, ...], name: str) -> Array:
     for key in keys:
         node = storage.getNode(key)
         if not node.empty():
-            matrix = node.mat() if node.isMap() else None
+            matrix = _mat(node)
             if matrix is None:
-                raise DataError(f"{name}: {key}: expected an OpenCV matrix")
+                raise DataError(f"{name}: {key}: expected an OpenCV matrix of rows x cols numbers")
             return np.asarray(matrix, dtype=np.float64)
     raise DataError(f"{name}: there is no {keys[0]} (nor {', '.join(keys[1:])})")
