@@ -223,6 +223,14 @@ def test_many_arrows_share_a_path_and_their_means_are_named() -> None:
     assert classes.count("arrow mean") == 48 + 1  # and the one in the legend
 
 
+def test_exact_data_have_a_histogram_too() -> None:
+    histogram = document()["residuals"]["histograms"][0]
+    exact = {**histogram, "edges_px": [0.0] * 21, "curve": None, "expected": None}
+    text = residual_histogram(exact)
+    assert "nan" not in text
+    assert text.count('class="bar"') == 20
+
+
 def test_bars_are_as_high_as_their_counts() -> None:
     histogram = document()["residuals"]["histograms"][0]
     bars = [a for a in Page(str(residual_histogram(histogram))).of("rect") if a["class"] == "bar"]
@@ -372,7 +380,7 @@ def test_numbers_are_printed_by_their_sigma() -> None:
     assert fixed(-1.5, 1) == "\N{MINUS SIGN}1.5"
     assert fixed(None, 2) == fixed(np.nan, 2) == significant(None) == ""
     assert [significant(v) for v in (0.0, 1.0, 12345.0, 0.00123, 1e-9)] == [
-        "0", "1.00", "12345", "0.00123", "1.00\N{MULTIPLICATION SIGN}10^\N{MINUS SIGN}9",
+        "0", "1.00", "12345", "0.00123", "1.00\N{MULTIPLICATION SIGN}10⁻⁹",
     ]  # fmt: skip
     assert [chance(p) for p in (1e-7, 0.034, 1.0, None)] == ["< 0.0001", "0.034", "1.0", ""]
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 
 MINUS = "\N{MINUS SIGN}"
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
 
 
@@ -38,7 +39,8 @@ def significant(value: float | None, digits: int = 3) -> str:
     size = math.floor(math.log10(abs(value)))
     if not -5 < size < 6:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}\N{MULTIPLICATION SIGN}10^{int(exponent)}".replace("-", MINUS)
+        power = str(int(exponent)).translate(_RAISED)
+        return f"{mantissa.replace('-', MINUS)}\N{MULTIPLICATION SIGN}10{power}"
     return fixed(value, max(digits - 1 - size, 0))
 
 

@@ -99,7 +99,7 @@ def residual_histogram(histogram: Mapping[str, Any]) -> Markup:
     )
     frame = Frame.filling(
         (WIDTH, 340.0), (float(edges[0]), float(edges[-1])), (0.0, 1.06 * float(top)),
-        margins=(14.0, 14.0, 44.0, 58.0),
+        margins=(14.0, 14.0, 44.0, 58.0 if top < 1e4 else 78.0),
     )  # fmt: skip
     bars = []
     for k, (low, high, count) in enumerate(zip(edges[:-1], edges[1:], counts, strict=True)):

@@ -93,7 +93,8 @@ class Frame:
     Attributes
     ----------
     left, top, width, height : the rectangle
-    x, y : data at its left and right, at its bottom and top (y down for pictures: swap them)
+    x, y : data at its left and right, at its bottom and top (y down for pictures: swap them); where
+        both are the same, that value is drawn at the left or the bottom
     """
 
     left: float
@@ -160,7 +161,7 @@ class Frame:
         """Where points (n, 2) are drawn."""
         points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
         (x0, x1), (y0, y1) = self.x, self.y
-        share = (points - [x0, y0]) / [x1 - x0, y1 - y0]
+        share = (points - [x0, y0]) / [(x1 - x0) or 1.0, (y1 - y0) or 1.0]
         return np.asarray([self.left, self.bottom] + share * [self.width, -self.height])
 
     def axes(
