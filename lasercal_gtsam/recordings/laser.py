@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from lasercal_gtsam.detect.candidates import find_candidates
+from lasercal_gtsam.detect.candidates import FINE, find_candidates
 from lasercal_gtsam.detect.options import DetectionOptions
 from lasercal_gtsam.detect.picture import read_frames
 from lasercal_gtsam.detect.pipeline import laser_light
@@ -23,8 +23,10 @@ LaserAt = Callable[[int], int]
 
 # One picture must outshine the other by this factor; people and shadows do both.
 _CLEARLY = 2.0
-# Pictures whose spot is weaker than this share of the strongest were exposed while it switched.
-_FULLY_LIT = 0.8
+# Share of the spot's light above which the laser is on, and below which it is off; pictures in
+# between were exposed while it was switched.
+_LIT, _DARK = 0.75, 0.25
+_PATCH = 32  # px about the spot that are looked at
 _COARSE_PIXELS = 1_500_000
 
 
@@ -42,49 +44,88 @@ class LaserStates:
     uniform: bool
 
 
+@dataclass(frozen=True)
+class Change:
+    """A compact light that one picture has and another has not.
+
+    ``height`` is that of the light in pixel values after a blur by 1.2 px, negative where the
+    first picture lacks it; (u, v) is where, and ``channel`` in which colour.
+    """
+
+    height: float
+    u: int = 0
+    v: int = 0
+    channel: str = "auto"
+
+
 def states_of(pictures: Sequence[Picture]) -> LaserStates:
-    """Tell laser-on from laser-off pictures of one stop by comparing each with the first.
+    """Tell laser-on from laser-off pictures of one stop.
 
     The camera and the hand stand still, so a compact light that one picture has and another has
-    not is the spot. Pictures exposed while the laser was switched (spot weaker than 80 % of the
-    strongest) and pictures that differ both ways (somebody walked through) are `UNKNOWN`.
+    not is the spot. Each picture is compared with the first; where the clearest difference is, the
+    light is measured in all of them. Pictures exposed while the laser was switched (25 % to 75 % of
+    the spot's light) and pictures that differ both ways (somebody walked through) are `UNKNOWN`.
     """
-    change = np.array([0.0, *(spot_change(p, pictures[0]) for p in pictures[1:])])
-    unclear = np.isnan(change)
-    strength = np.where(unclear, 0.0, change)
+    shown = [_coarse(picture) for picture in pictures]
+    changes = [_change(picture, shown[0]) for picture in shown]
+    clear = [change for change in changes if change is not None]
+    clearest = max(clear, key=lambda change: abs(change.height))
     state = np.zeros(len(pictures), dtype=np.int8)
-    brighter, darker = strength > 0, strength < 0
-    if not (brighter.any() or darker.any()):
+    if clearest.height == 0:
         return LaserStates(state, uniform=True)
-    state[brighter & (strength >= _FULLY_LIT * strength.max())] = ON
-    state[darker & (strength <= _FULLY_LIT * strength.min())] = OFF
-    if not (brighter.any() and darker.any()):  # else the first is itself between on and off
-        state[(strength == 0) & ~unclear] = OFF if brighter.any() else ON
+    level = np.array(
+        [
+            np.nan if change is None else _light_at(picture, shown[0], clearest)
+            for picture, change in zip(shown, changes, strict=True)
+        ]
+    )
+    share = (level - np.nanmin(level)) / (np.nanmax(level) - np.nanmin(level))
+    state[share >= _LIT] = ON
+    state[share <= _DARK] = OFF
     return LaserStates(state, uniform=False)
 
 
-def spot_change(picture: Picture, reference: Picture) -> float:
-    """Height of the spot that ``picture`` has and ``reference`` has not; negative the other way.
+def spot_appears(picture: Picture, reference: Picture) -> bool | None:
+    """Whether ``picture`` has a spot that ``reference`` has not; None where they differ otherwise.
 
-    Zero where neither has light that the other has not, NaN where both have (or the pictures are
-    of another kind). The height is in pixel values after a blur by 1.2 px.
+    False where the two are alike, and where it is the reference that has it.
     """
+    change = _change(_coarse(picture), _coarse(reference))
+    return None if change is None else change.height > 0
+
+
+def _change(picture: Picture, reference: Picture) -> Change | None:
+    """The spot by which two pictures differ; None where each has light that the other has not."""
     if picture.shape != reference.shape or picture.dtype != reference.dtype:
-        return float("nan")
-    a, b = _coarse(picture), _coarse(reference)
-    more, less = _appearing(a, b), _appearing(b, a)
-    if more == less == 0:
-        return 0.0
-    if more >= _CLEARLY * less:
+        return None
+    more, less = _appearing(picture, reference), _appearing(reference, picture)
+    if more.height >= _CLEARLY * less.height:
         return more
-    return -less if less >= _CLEARLY * more else float("nan")
+    return replace(less, height=-less.height) if less.height >= _CLEARLY * more.height else None
 
 
-def _appearing(on: Picture, off: Picture) -> float:
+def _appearing(on: Picture, off: Picture) -> Change:
     options = DetectionOptions()
-    difference = laser_light(read_frames(on, off, options), options)
-    ranked = find_candidates(difference, options.threshold_sigmas).ranked
-    return ranked[0].peak if ranked else 0.0
+    frames = read_frames(on, off, options)
+    ranked = find_candidates(laser_light(frames, options), options.threshold_sigmas).ranked
+    if not ranked:
+        return Change(0.0)
+    channel = "auto" if on.ndim == 2 else frames.channel
+    return Change(ranked[0].peak, ranked[0].u, ranked[0].v, channel)
+
+
+def _light_at(picture: Picture, reference: Picture, spot: Change) -> float:
+    """Light at the spot's place above that of the reference; the lamp's flicker is taken out."""
+    import cv2
+
+    rows = slice(max(spot.v - _PATCH, 0), spot.v + _PATCH + 1)
+    columns = slice(max(spot.u - _PATCH, 0), spot.u + _PATCH + 1)
+    options = DetectionOptions(channel=spot.channel)
+    frames = read_frames(picture[rows, columns], reference[rows, columns], options)
+    assert frames.off is not None
+    light = frames.on - frames.off
+    blurred = cv2.GaussianBlur(light, (0, 0), FINE, borderType=cv2.BORDER_REPLICATE)
+    return float(blurred[spot.v - rows.start, spot.u - columns.start] - np.median(light))
 
 
 def _coarse(picture: Picture) -> Picture:

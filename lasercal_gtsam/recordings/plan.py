@@ -18,7 +18,7 @@ from lasercal_gtsam.recordings.laser import (
     LaserAt,
     States,
     most_central,
-    spot_change,
+    spot_appears,
     states_of,
 )
 from lasercal_gtsam.recordings.motion import Motion
@@ -307,9 +307,9 @@ class _Chooser:
         stamp, off = min(offs, key=lambda pair: (abs(pair[0] - shot.stamp), pair[0]))
         if not pending.sure:
             read: Mapping[int, Picture] = dict(pending.source.read(sorted({shot.on, off})))
-            change = spot_change(read[shot.on], read[off])
-            if not change > 0:
-                self.left_out.append(f"{where}: {_no_spot(change, stamp - self._origin)}")
+            appears = spot_appears(read[shot.on], read[off])
+            if not appears:
+                self.left_out.append(f"{where}: {_no_spot(appears, stamp - self._origin)}")
                 return None
         return replace(shot, off=off, off_stamp=stamp)
 
@@ -318,9 +318,9 @@ class _Chooser:
         return f"{first:.2f} to {last:.2f} s"
 
 
-def _no_spot(change: float, off: int) -> str:
+def _no_spot(appears: bool | None, off: int) -> str:
     against = f"the laser-off picture at {off / NS_PER_S:.2f} s"
-    if np.isnan(change):
+    if appears is None:
         return f"its pictures are all alike and differ from {against} by more than a spot"
     return f"no spot: its pictures are all alike and show no more light than {against}"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,7 @@ def small_capture(folder: Path, groups: int = 2, shots: int = 2, **render: Any) 
     return load_capture(write_simulation(folder, simulation, spots=False, pictures=pictures))
 
 
+@cache
 def picture(path: Path | None, size: tuple[int, int] = SIZE) -> np.ndarray:
     assert path is not None
     return read_picture(path, size, "test")
@@ -70,7 +72,7 @@ class Session:
 
     stop_ns: int = 1000 * MS
     move_ns: int = 400 * MS
-    pose_every_ns: int = 20 * MS
+    pose_every_ns: int = 40 * MS
     picture_every_ns: int = 100 * MS
     picture_delay_ns: int = 7 * MS  # never at the stamp of a pose
     encoding: str = "mono8"
@@ -91,8 +93,9 @@ class Session:
         T = capture.T_base_hand
         end = START + len(T) * period - self.move_ns
         yield from static_events(START)
-        for stamp in range(START, end, self.pose_every_ns):
-            yield from self.pose_events(stamp, self.hand(T, stamp, rng))
+        for stamp in range(START, end + 300 * MS, self.pose_every_ns):
+            progress = (stamp - START) // period + self.moving_share(stamp)
+            yield from self.pose_events(stamp, self.hand(T, stamp, rng), progress)
         for stamp in range(START + self.picture_delay_ns, end, self.picture_every_ns):
             k, within = divmod(stamp - START, period)
             yield self.image_event(stamp + self.image_shift_ns, self.frame(capture, k, within, rng))
@@ -107,14 +110,15 @@ class Session:
         return [(0, first), (int(0.45 * self.stop_ns), not first), (self.stop_ns, False)]
 
     def hand(self, T: Array, stamp: int, rng: np.random.Generator) -> Array:
-        k, within = divmod(stamp - START, self.stop_ns + self.move_ns)
+        k = min((stamp - START) // (self.stop_ns + self.move_ns), len(T) - 1)
+        share = self.moving_share(stamp)
         pose = T[k].copy()
-        if within >= self.stop_ns and k + 1 < len(T):
-            share = (within - self.stop_ns) / self.move_ns
-            turn = Rotation.from_matrix(T[k, :3, :3].T @ T[k + 1, :3, :3]).as_rotvec()
+        if share > 0:
+            then = T[min(k + 1, len(T) - 1)]
+            turn = Rotation.from_matrix(T[k, :3, :3].T @ then[:3, :3]).as_rotvec()
             pose[:3, :3] = T[k, :3, :3] @ Rotation.from_rotvec(share * turn).as_matrix()
-            pose[:3, 3] += share * (T[k + 1, :3, 3] - T[k, :3, 3])
-            pose[2, 3] += 0.05 * np.sin(np.pi * share)  # moves even between equal poses
+            pose[:3, 3] += share * (then[:3, 3] - T[k, :3, 3])
+            pose[2, 3] += 0.05 * np.sin(np.pi * share)  # also between equal poses
         pose[:3, 3] += self.jitter_m * rng.uniform(-1, 1, 3)
         return pose
 
@@ -139,12 +143,14 @@ class Session:
             light = light + 0.004 * full * rng.standard_normal(light.shape)
         return as_depth(light, full)
 
-    def pose_events(self, stamp: int, T: Array) -> Iterator[Event]:
+    def moving_share(self, stamp: int) -> float:
+        within = (stamp - START) % (self.stop_ns + self.move_ns)
+        return max(0.0, (within - self.stop_ns) / self.move_ns)
+
+    def pose_events(self, stamp: int, T: Array, progress: float) -> Iterator[Event]:
         if self.poses_as == "tf":
             # two joints that both move between stops, such that the tool is where it must be
-            k, within = divmod(stamp - START, self.stop_ns + self.move_ns)
-            turned = k + max(0.0, (within - self.stop_ns) / self.move_ns)
-            A = rigid(Rotation.from_rotvec([0.1, 0.2, 0.9 * np.sin(turned)]), [0, 0, 0.3])
+            A = rigid(Rotation.from_rotvec([0.1, 0.2, 0.9 * np.sin(progress)]), [0, 0, 0.3])
             B = np.linalg.inv(A) @ T @ np.linalg.inv(TOOL)
             yield stamp + 2 * MS, "/tf", "tf", [("base_link", "arm", stamp, A)]
             yield stamp + 2 * MS, "/tf", "tf", [("arm", "flange", stamp, B)]

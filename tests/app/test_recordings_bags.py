@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from cli_support import Cli
 from recording_cases import START, STORAGES, Session, picture, small_capture, write_bag
 
+from lasercal_gtsam.api import calibrate
 from lasercal_gtsam.io.capture import Capture, load_capture
 
 FRAMES = ("--base", "base_link", "--hand", "tool0")
@@ -18,6 +20,12 @@ FRAMES = ("--base", "base_link", "--hand", "tool0")
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return small_capture(tmp_path_factory.mktemp("made") / "capture")
+
+
+@pytest.fixture(scope="module")
+def few(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Four rows, two on each plane."""
+    return small_capture(tmp_path_factory.mktemp("made") / "few", groups=1)
 
 
 @pytest.fixture(scope="module")
@@ -76,3 +84,243 @@ def test_laser_topic_says_what_the_pictures_show(laser, bags, capture, lasercal,
                 for name, own in (("on", capture.images_on[k]), ("off", capture.images_off[k]))
             }
             assert distance[state] < 0.2 * max(distance.values())
+
+
+@pytest.mark.slow
+def test_calibration_of_the_bag_is_that_of_the_capture(lasercal, tmp_path):
+    made = small_capture(tmp_path / "capture", groups=3, shots=4)
+    bag = recorded(tmp_path, made, Session())
+    out = tmp_path / "out"
+    assert lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane").status == 0
+    tables = []
+    for capture in (made, load_capture(out)):
+        result = calibrate(capture.observations(), options=capture.options(distortion="none"))
+        assert result.fit.converged
+        tables.append([(p.refined, p.sigma) for p in result.parameters])
+    np.testing.assert_allclose(tables[1], tables[0], rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "kind", ["geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/TransformStamped"]
+)
+@pytest.mark.parametrize("storage", ["ros1", "mcap"])
+def test_pose_topic_instead_of_tf(kind, storage, few, lasercal, tmp_path):
+    bag = recorded(tmp_path, few, Session(poses_as=kind), storage)
+    out = tmp_path / "out"
+    topic = ("--pose-topic", "/hand_pose", "--plane-topic", "/plane")
+    outcome = lasercal("import", bag, "-o", out, *topic)
+    assert outcome.status == 0, outcome.err
+    assert_same(load_capture(out), few)
+    wrong = lasercal("import", bag, "--dry-run", "--base", "world", *topic)
+    assert wrong.status == 1
+    assert "its base is 'base_link', not 'world'" in wrong.err
+
+
+def test_jitter_of_the_encoders_is_no_motion(few, lasercal, tmp_path):
+    jitter_m = 20e-6
+    bag = recorded(tmp_path, few, Session(jitter_m=jitter_m))
+    out = tmp_path / "out"
+    assert lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane").status == 0
+    assert_same(load_capture(out), few, digits=jitter_m)
+    noisy = lasercal("import", bag, "--dry-run", *FRAMES, "--plane", "1", "--still-mm", "0.02")
+    assert noisy.status == 1
+    assert "the hand never stands still: the least that it moves within 0.3 s is 0.0" in noisy.err
+    assert "--still-mm" in noisy.err
+
+
+def test_compressed_pictures(few, lasercal, tmp_path):
+    out = tmp_path / "out"
+    bag = recorded(tmp_path, few, Session(compressed="png"), "sqlite3")
+    assert lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane").status == 0
+    assert_same(load_capture(out), few)
+
+
+def test_sixteen_bits_in_either_byte_order(lasercal, tmp_path):
+    deep = small_capture(tmp_path / "capture", 1, 2, bits=16)
+    session = Session(encoding="mono16", big_endian=True, padding=6)
+    out = tmp_path / "out"
+    bag = recorded(tmp_path, deep, session, "ros1")
+    assert lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane").status == 0
+    assert_same(load_capture(out), deep)
+
+
+# --- the laser ----------------------------------------------------------------------------------
+
+
+def test_stops_without_an_off_picture_get_the_nearest_of_their_plane(few, lasercal, tmp_path):
+    session = Session(always_on_at=(1,), always_off_at=(2,))
+    bag = recorded(tmp_path, few, session)
+    out = tmp_path / "out"
+    outcome = lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane")
+    assert outcome.status == 0, outcome.err
+    assert "1 stops have no laser-off picture of their own (stop 2)" in outcome.err
+    assert "stop 3 (2.95 to 3.6" in outcome.out
+    assert "no spot: its pictures are all alike" in outcome.out
+    found = load_capture(out)
+    assert found.ids.tolist() == ["001", "002", "004"]
+    np.testing.assert_array_equal(picture(found.images_off[1]), picture(found.images_off[0]))
+    story = json.loads((out / "recording.json").read_text())
+    assert [row["off_of_same_stop"] for row in story["rows"]] == [True, False, True]
+
+
+def test_laser_that_is_always_on(few, lasercal, tmp_path):
+    bag = recorded(tmp_path, few, Session(off=False))
+    seen = lasercal("import", bag, "-o", tmp_path / "a", *FRAMES, "--plane", "1")
+    assert seen.status == 0
+    assert "no picture without a spot was found: the laser is taken to be on" in seen.err
+    told = lasercal("import", bag, "-o", tmp_path / "b", *FRAMES, "--plane", "1", "--laser-on")
+    assert told.status == 0
+    found = load_capture(tmp_path / "a")
+    assert found.images_off == (None,) * len(few)
+    for k in range(len(few)):
+        np.testing.assert_array_equal(
+            picture(found.images_on[k]), picture(load_capture(tmp_path / "b").images_on[k])
+        )
+
+
+# --- clocks, planes -----------------------------------------------------------------------------
+
+
+def test_clocks_that_differ_are_noticed_and_can_be_set_right(few, lasercal, tmp_path):
+    hour, minute = 3_600_000_000_000, 60_000_000_000
+    bag = recorded(tmp_path, few, Session(image_shift_ns=hour))
+    apart = lasercal("import", bag, "--dry-run", *FRAMES, "--plane", "1")
+    assert apart.status == 1
+    assert "do not overlap" in apart.err
+    assert "59.9 min apart" in apart.err
+    out = tmp_path / "out"
+    right = lasercal(
+        "import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane", "--image-offset", "-3600"
+    )
+    assert right.status == 0, right.err
+    assert_same(load_capture(out), few)
+    (tmp_path / "near").mkdir()
+    near = recorded(tmp_path / "near", few, Session(image_shift_ns=-minute // 30))
+    noted = lasercal("import", near, "--dry-run", *FRAMES, "--plane", "1")
+    assert noted.status == 0
+    assert "/camera/image_raw is received 2.03 s after its stamps, /tf 2 ms" in noted.err
+
+
+def test_received_time_serves_where_stamps_are_wrong(few, lasercal, tmp_path):
+    bag = recorded(tmp_path, few, Session(image_shift_ns=-10_000_000_000))
+    out = tmp_path / "out"
+    outcome = lasercal(
+        "import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane", "--stamps", "received"
+    )
+    assert outcome.status == 0, outcome.err
+    assert_same(load_capture(out), few)
+
+
+def test_planes_by_intervals(bags, capture, lasercal, tmp_path):
+    table = tmp_path / "planes.csv"
+    table.write_text("start_s,end_s,plane\n0,5.5,table\n8.5,20,wedge\n")
+    out = tmp_path / "out"
+    outcome = lasercal("import", bags["mcap"], "-o", out, *FRAMES, "--planes", table)
+    assert outcome.status == 0, outcome.err
+    assert load_capture(out).planes.tolist() == ["table"] * 4 + ["wedge"] * 2
+    assert outcome.out.count("no plane is said for it") == 2
+    stamps = tmp_path / "stamps.csv"
+    stamps.write_text("start_stamp,end_stamp,plane\n1699999999,1700000005.6,a\n,1700000100,b\n")
+    wrong = lasercal("import", bags["mcap"], "--dry-run", *FRAMES, "--planes", stamps)
+    assert wrong.status == 1
+    assert "stamps.csv:3: start_stamp: expected seconds, got ''" in wrong.err
+
+
+# --- what can be wrong --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.999])
+def test_cut_bag_says_how_to_mend_it(storage, share, bags, lasercal, tmp_path):
+    whole = bags[storage]
+    file = whole if whole.is_file() else next(p for p in whole.iterdir() if p.suffix != ".yaml")
+    cut = tmp_path / file.name
+    content = file.read_bytes()
+    cut.write_bytes(content[: int(share * len(content))])
+    outcome = lasercal("import", cut, "--dry-run", *FRAMES, "--plane", "1")
+    assert outcome.status == 1
+    assert f"{cut}: the bag cannot be read" in outcome.err
+    mend = {"ros1": "rosbag reindex", "mcap": "mcap recover", "sqlite3": "ros2 bag reindex"}
+    assert mend[storage] in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+def test_bag_without_metadata_is_read_all_the_same(storage, bags, capture, lasercal, tmp_path):
+    file = next(p for p in bags[storage].iterdir() if p.suffix != ".yaml")
+    (tmp_path / "bare").mkdir()
+    copy = tmp_path / "bare" / file.name
+    copy.write_bytes(file.read_bytes())
+    for path in (copy, copy.parent):
+        rows = lasercal.json("import", path, "--dry-run", *FRAMES, "--plane", "1")["rows"]
+        np.testing.assert_allclose(
+            [r["T_base_hand"] for r in rows], capture.T_base_hand, atol=1e-14
+        )
+
+
+def test_bag_in_two_parts(few, lasercal, tmp_path):
+    events = list(Session().events(few))
+    half = START + 2_500_000_000
+    parts = [
+        write_bag(tmp_path / name, "ros1", [e for e in events if (e[0] < half) == early])
+        for name, early in (("one", True), ("two", False))
+    ]
+    out = tmp_path / "out"
+    outcome = lasercal("import", *parts, "-o", out, *FRAMES, "--plane-topic", "/plane")
+    assert outcome.status == 0, outcome.err
+    assert_same(load_capture(out), few)
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--base", "base_lnk", "--hand", "tool0"], "did you mean 'base_link'?); the recording"),
+        (["--base", "base_link", "--hand", "world"], "does not move in base_link"),
+        ([*FRAMES, "--images", "/camera/image"], "did you mean '/camera/image_raw'"),
+        ([*FRAMES, "--images", "/tf"], "topics that would do: /camera/image_raw"),
+        ([*FRAMES, "--laser-topic", "/plane"], "expected std_msgs/msg/Bool"),
+        (["--pose-topic", "/tf"], "none would do"),
+        ([*FRAMES, "--still-s", "3"], "the hand never stands still"),
+        ([*FRAMES, "--max-gap", "0.01"], "its poses come every 40 ms"),
+        ([*FRAMES, "--images", "a/b=/camera/image_raw"], "may hold letters"),
+    ],
+)
+def test_mistakes_are_named(args, words, bags, lasercal):
+    outcome = lasercal("import", bags["mcap"], "--dry-run", "--plane", "1", *args)
+    assert outcome.status == 1
+    assert words in outcome.err
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        ([], "give -o/--output"),
+        (["--dry-run", "--plane", "1"], "give --base and --hand"),
+        (["--dry-run", *FRAMES], "give one of --plane, --planes"),
+        (["--dry-run", "--poses", "p", "--plane", "1"], "none is assumed"),
+        (["--dry-run", *FRAMES, "--plane", "1", "--laser-on", "--laser-topic", "/l"], "not both"),
+    ],
+)
+def test_usage(args, words, bags, lasercal):
+    outcome = lasercal("import", bags["mcap"], *args)
+    assert outcome.status == 2
+    assert words in outcome.err
+
+
+def test_list_shows_topics_cameras_and_frames(bags, lasercal, tmp_path):
+    outcome = lasercal("import", bags["sqlite3"], "--list")
+    assert outcome.status == 0
+    assert "  /camera/image_raw  sensor_msgs/msg/Image  108 messages" in outcome.out
+    assert "K [137.5, 0.0, 79.5" in outcome.out
+    assert "        flange (every 40 ms)\n          tool0 (static)" in outcome.out
+    assert lasercal.json("import", bags["ros1"], "--list")["frames"][0] == "arm"
+    nothing = lasercal("import", tmp_path, "--list")
+    assert nothing.status == 1
+    assert "this is no bag" in nothing.err
+
+
+def test_without_rosbags_the_extra_is_named(bags, lasercal, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    outcome = lasercal("import", bags["mcap"], "--list")
+    assert outcome.status == 1
+    assert "pip install 'lasercal-gtsam[ros]'" in outcome.err
