@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,11 +18,12 @@ from lasercal_gtsam.calibration import (
     rms_px,
 )
 from lasercal_gtsam.cell import Cell
-from lasercal_gtsam.errors import DataError, DegenerateError
+from lasercal_gtsam.errors import DataError, DegenerateError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import make_batch, state_from_cell
 from lasercal_gtsam.hand_noise.refine import refine_with_hand_noise
 from lasercal_gtsam.holds import Holds, resolve_holds
+from lasercal_gtsam.lens_choice import choose_lens
 from lasercal_gtsam.losses import THRESHOLDS
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
@@ -88,26 +90,61 @@ def calibrate(
     batch = make_batch(observations, options.sigma_px)
     search = Search(observations, batch, holds, options)
     ways = _given_start(initial) if initial is not None else _closed_form_starts(search)
-
-    def finish(solution: Solution, rejected: Mask) -> Finished:
-        if options.noisy_hand:
-            found = refine_with_hand_noise(search, solution, rejected)
-            levels = found.levels
-            return Finished(*found[:3], levels.found, levels.words)
-        return Finished(solution, lengths_of(search, solution.cell))
-
-    if options.robust == "none":
-        finished = finish(ways.refine(search, ways.starts), np.zeros(len(batch), np.bool_))
-        accepted = Accepted(finished, (None,) * len(batch), ways.starts[0])
+    notes: tuple[str, ...] = ()
+    if options.distortion == "auto":
+        begun = _with_most_terms(search, ways)
+        start = initial or begun.start
+        lens = choose_lens(search, begun.finished.solution, start)
+        search = replace(search, holds=lens.holds)
+        ways, notes = _given_start(lens.cell), lens.notes
+        accepted = _begun_by(begun, _without_outliers(search, ways))._replace(start=start)
     else:
-        accepted = refine_without_outliers(search, ways, finish)
+        accepted = _without_outliers(search, ways)
     if options.robust == "gnc-tls":
+        finish = partial(_finish, search)
         accepted = refine_truncated(search, accepted, ways.refine, finish)
     elif options.robust not in ("auto", "none"):
         accepted = refine_with_loss(search, accepted, options.robust)
     if initial is not None:
         accepted = accepted._replace(start=initial)
-    return assemble(search, accepted)
+    return assemble(search, accepted, notes)
+
+
+def _without_outliers(search: Search, ways: Ways) -> Accepted:
+    """Least squares on the spots that fit; on all of them with ``robust="none"``."""
+    finish = partial(_finish, search)
+    if search.options.robust != "none":
+        return refine_without_outliers(search, ways, finish)
+    nobody = np.zeros(len(search.batch), np.bool_)
+    finished = finish(ways.refine(search, ways.starts), nobody)
+    return Accepted(finished, (None,) * len(nobody), ways.starts[0])
+
+
+def _finish(search: Search, solution: Solution, rejected: Mask) -> Finished:
+    if search.options.noisy_hand:
+        found = refine_with_hand_noise(search, solution, rejected)
+        levels = found.levels
+        return Finished(*found[:3], levels.found, levels.words)
+    return Finished(solution, lengths_of(search, solution.cell))
+
+
+def _begun_by(first: Accepted, then: Accepted) -> Accepted:
+    """The second answer, with the iterations of the first that led to it."""
+    solution = then.finished.solution
+    iterations = first.finished.solution.iterations + solution.iterations
+    solution = replace(solution, iterations=iterations)
+    return then._replace(finished=then.finished._replace(solution=solution))
+
+
+def _with_most_terms(search: Search, ways: Ways) -> Accepted:
+    """With all distortion terms or, where that has no good answer, with none."""
+    try:
+        accepted = _without_outliers(search, ways)
+        if accepted.finished.solution.plausible:
+            return accepted
+    except (DegenerateError, SolveError):
+        pass
+    return _without_outliers(replace(search, holds=search.holds.without_distortion()), ways)
 
 
 def stop_notes(observations: Observations, options: CalibrationOptions) -> list[str]:
@@ -173,7 +210,7 @@ def _closed_form_starts(search: Search) -> Ways:
     )
 
 
-def assemble(search: Search, accepted: Accepted) -> Calibration:
+def assemble(search: Search, accepted: Accepted, remarks: Sequence[str] = ()) -> Calibration:
     """Sigmas, table, spots and the status sentence of a solution.
 
     The residuals refer to the spots as observed, with the commanded hand poses.
@@ -197,6 +234,7 @@ def assemble(search: Search, accepted: Accepted) -> Calibration:
         *report_notes(solution.cell, uncertainty),
         *finished.words,
         *stop_notes(observations, options),
+        *remarks,
     )
     return Calibration(
         cell=cell,
@@ -277,9 +315,4 @@ def _check_request(
             f"options.robust: {options.robust!r} weighs spots one by one, which those of one stop "
             "with a common error of the hand cannot be; use 'auto', 'gnc-tls' or 'none', or leave "
             "Observations.stop out"
-        )
-    if options.distortion == "auto":
-        raise DataError(
-            "options.distortion: 'auto' is not available yet; use 'all', 'none' or names out of "
-            "k1, k2, p1, p2"
         )

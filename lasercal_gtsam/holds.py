@@ -77,6 +77,26 @@ class Holds:
                     held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(term)] = True
         return replace(self, held=held)
 
+    def leaving_out(self, terms: Mapping[str, tuple[str, ...]]) -> Holds:
+        """Hold distortion terms of cameras at the start's values; their priors go with them.
+
+        Parameters
+        ----------
+        terms : camera -> terms; as in "auto", where they were found not to be needed
+        """
+        held, words, dropped = self.held.copy(), list(self.words), set[str]()
+        for c, camera in enumerate(self.known):
+            left_out = terms.get(camera, ())
+            prefix = f"{camera}." if len(self.known) > 1 else ""
+            for term in left_out:
+                held[c * len(CAMERA_TANGENT) + CAMERA_TANGENT.index(term)] = True
+                dropped.add(prefix + term)
+            if left_out:
+                names = ", ".join(prefix + term for term in left_out)
+                words.append(f"{names} held at the start's value (distortion='auto')")
+        priors = {name: prior for name, prior in self.priors.items() if name not in dropped}
+        return replace(self, held=held, priors=priors, words=tuple(words))
+
 
 def resolve_holds(
     observations: Observations, options: CalibrationOptions, initial: Cell | None = None
@@ -133,7 +153,7 @@ class _Builder:
             self.held[first + CAMERA_TANGENT.index(name)] = True
 
     def distortion(self, wanted: str | tuple[str, ...]) -> None:
-        if wanted == "all":
+        if wanted in ("all", "auto"):  # `lens_choice` decides later
             return
         keep: tuple[str, ...] = () if isinstance(wanted, str) else tuple(wanted)
         held = [term for term in DISTORTION_NAMES if term not in keep]

@@ -47,10 +47,11 @@ CALIBRATION_FILE = "calibration.json"
 @click.option(
     "--distortion",
     type=Distortion(),
-    metavar="all|none|k1,k2",
+    metavar="all|none|auto|k1,k2",
     default="all",
     show_default=True,
-    help="Terms of the lens distortion to estimate, out of k1, k2, p1, p2.",
+    help="Terms of the lens distortion to estimate, out of k1, k2, p1, p2; auto: those that the "
+    "spots can carry.",
 )
 @click.option(
     "--known",

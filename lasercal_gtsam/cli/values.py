@@ -48,7 +48,7 @@ class Assignment(_ParamType):
 
 
 class Distortion(_ParamType):
-    """``all``, ``none`` or names of distortion terms separated by commas."""
+    """``all``, ``none``, ``auto`` or names of distortion terms separated by commas."""
 
     name = "distortion"
 
@@ -56,12 +56,12 @@ class Distortion(_ParamType):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> str | tuple[str, ...]:
         """Check the names."""
-        if value in ("all", "none") or isinstance(value, tuple):
+        if value in ("all", "none", "auto") or isinstance(value, tuple):
             return value  # type: ignore[no-any-return]
         names = tuple(name.strip() for name in str(value).split(","))
         if not set(names) <= set(DISTORTION_NAMES):
             allowed = ",".join(DISTORTION_NAMES)
-            self.fail(f"{value!r} is not 'all', 'none' or some of {allowed}", param, ctx)
+            self.fail(f"{value!r} is not 'all', 'none', 'auto' or some of {allowed}", param, ctx)
         return names
 
 
