@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Literal, get_args
 
+import numpy as np
+
 from lasercal_gtsam.cell import INTRINSIC_NAMES, Camera, Cell
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.formats.intrinsics import KnownIntrinsics
@@ -26,10 +28,11 @@ def with_intrinsics(
 ) -> tuple[CalibrationOptions, tuple[str, ...]]:
     """Options with lenses held at what files say (``"known"``), or with priors on them.
 
-    A prior is on each number for itself: what a file's covariance says of how they go together is
-    not used. What the options hold already stays held. Numbers without a sigma, in the file or in ``sigmas``, cannot have a prior; a number
-    that was held where the file was made (sigma 0) is held here. ``"start"`` changes no options:
-    see `start_with_intrinsics`.
+    A prior is on each number for itself; how a file's covariance says that they go together cannot
+    be used, and `prior_sigmas` widens the sigmas so that nothing is claimed that the file does not
+    say. What the options hold already stays held. A number without a sigma, in the file or in
+    ``sigmas``, cannot have a prior; one that was held where the file was made (sigma 0) is held
+    here. ``"start"`` changes no options: see `start_with_intrinsics`.
 
     Parameters
     ----------
@@ -63,7 +66,8 @@ def with_intrinsics(
     words: list[str] = []
     for name, lens in given.items():
         prefix = _prefix(observations, name)
-        found = {**prior_sigmas(lens), **(sigmas or {})}
+        from_file, factor = prior_sigmas(lens)
+        found = {**from_file, **(sigmas or {})}
         if missing := [row for row in ROWS if row not in found]:
             raise DataError(
                 f"{lens.path}: a {lens.form} file without a covariance: a prior needs a sigma for "
@@ -81,9 +85,10 @@ def with_intrinsics(
                 priors.setdefault(prefix + row, (float(value), found[row]))
             else:
                 known[prefix + term] = float(getattr(lens.intrinsics, term))
-        if lens.covariance is not None:
+        if factor > 1:
             words.append(
-                f"{lens.path}: the sigmas are used as priors, not how the numbers go together"
+                f"{lens.path}: the priors are independent, so that the file's sigmas are widened "
+                f"{factor:.2g} times: together they claim no more than its covariance"
             )
     return replace(options, known=known, priors=priors), tuple(words)
 
@@ -121,18 +126,29 @@ def start_with_intrinsics(
     return calibrate(observations, options=replace(held, priors=priors)).cell
 
 
-def prior_sigmas(lens: KnownIntrinsics) -> dict[str, float]:
-    """Sigmas of the table's rows from a file's covariance; empty where it has none."""
+def prior_sigmas(lens: KnownIntrinsics) -> tuple[dict[str, float], float]:
+    """Sigmas of independent priors on the table's rows, and the factor they were widened by.
+
+    With ``D`` the variances and ``w`` the largest eigenvalue of the correlations, ``w D`` is the
+    smallest multiple of ``D`` that is nowhere tighter than the file's covariance. Rows that were
+    held have 0; without a covariance there are none.
+    """
     if lens.covariance is None:
-        return {}
-    sigmas = lens.sigmas
-    C, intrinsics = lens.covariance, lens.intrinsics
+        return {}, 1.0
     # alpha_c = skew / fu
-    by_fu, by_skew = -intrinsics.skew / intrinsics.fu**2, 1 / intrinsics.fu
-    variance = by_fu**2 * C[0, 0] + 2 * by_fu * by_skew * C[0, 2] + by_skew**2 * C[2, 2]
-    held = sigmas.pop("skew") == 0
-    sigmas["alpha_c"] = 0.0 if held else float(max(variance, 0.0)) ** 0.5
-    return sigmas
+    J = np.eye(9)
+    J[2, 0] = -lens.intrinsics.skew / lens.intrinsics.fu**2
+    J[2, 2] = 1 / lens.intrinsics.fu
+    held = np.diag(lens.covariance) <= 0
+    covariance = J @ lens.covariance @ J.T
+    sigmas = np.where(held, 0.0, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    free = np.flatnonzero(sigmas > 0)
+    factor = 1.0
+    if free.size:
+        scale = np.outer(sigmas[free], sigmas[free])
+        correlation = covariance[np.ix_(free, free)] / scale
+        factor = float(np.sqrt(max(1.0, np.linalg.eigvalsh(correlation)[-1])))
+    return dict(zip(ROWS, (factor * sigmas).tolist(), strict=True)), factor
 
 
 def check_given(observations: Observations, given: Mapping[str, KnownIntrinsics], how: How) -> None:

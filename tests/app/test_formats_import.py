@@ -11,7 +11,11 @@ from format_cases import CAMERA, calibrated, random_covariance, two_cameras, wit
 
 import lasercal_gtsam as lc
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.formats.given_intrinsics import start_with_intrinsics, with_intrinsics
+from lasercal_gtsam.formats.given_intrinsics import (
+    prior_sigmas,
+    start_with_intrinsics,
+    with_intrinsics,
+)
 
 LENS = [612.5, 611.25, 0.0, 322.75, 238.5, -0.31, 0.11, 0.0007, -0.0002]
 
@@ -276,11 +280,15 @@ def test_known_intrinsics_are_held_to_the_last_digit(lens):
 def test_priors_add_what_the_file_knows(lens):
     seen = calibrated().inputs.observations
     options, words = with_intrinsics(lc.CalibrationOptions(), seen, {CAMERA: lens["json"]}, "prior")
-    assert "not how the numbers go together" in words[0]
+    assert "widened" in words[0]
+    assert "claim no more" in words[0]
     assert options.known == {"skew": 0.0}  # held where it came from
     base = calibrated()
+    factor = options.priors["fu"][1] / base["fu"].sigma
+    assert 1 < factor < 3
     for row in ("fu", "v0", "k1", "p2"):
-        assert options.priors[row] == pytest.approx((base[row].refined, base[row].sigma), rel=1e-9)
+        wanted = (base[row].refined, factor * base[row].sigma)
+        assert options.priors[row] == pytest.approx(wanted, rel=1e-9)
     found = lc.calibrate(seen, options=options)
     for row in ("fu", "v0", "k1", "p2"):
         assert 0 < found[row].sigma < base[row].sigma
@@ -293,7 +301,23 @@ def test_the_sigma_of_alpha_is_carried_over_from_the_skew(tmp_path):
     seen = calibration.inputs.observations
     options, _ = with_intrinsics(lc.CalibrationOptions(), seen, {CAMERA: found}, "prior")
     row = calibration["alpha_c"]
-    assert options.priors["alpha_c"] == pytest.approx((row.refined, row.sigma), rel=1e-9)
+    factor = options.priors["fu"][1] / calibration["fu"].sigma
+    assert options.priors["alpha_c"] == pytest.approx((row.refined, factor * row.sigma), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_independent_priors_claim_no_more_than_the_files_covariance(seed, lens):
+    covariance = random_covariance(seed)[6:, 6:]
+    sigmas, _ = prior_sigmas(replace(lens["json"], covariance=covariance))
+    fu = lens["json"].intrinsics.fu
+    scale = np.ones(9)
+    scale[2] = 1 / fu  # alpha_c, at a skew of 0
+    variances = np.array(list(sigmas.values())) ** 2
+    rows = covariance * np.outer(scale, scale)
+    unit = np.sqrt(np.diag(rows))
+    excess = np.linalg.eigvalsh((np.diag(variances) - rows) / np.outer(unit, unit))
+    assert excess[0] == pytest.approx(0, abs=1e-9)  # nowhere tighter, and no wider than needed
+    assert excess[-1] > 0.1
 
 
 def test_a_prior_needs_sigmas(lens):
