@@ -182,7 +182,8 @@ def _report(
         *(f"  {name:<18} {what}" for name, what in _CONTENTS.items()),
         wrapped(
             f"Next: look at {REPORT_FILE} and {SHEET_FILE}. 'lasercal calibrate {out}' does the "
-            "last two steps from the folder; for your own pictures and hand poses write a capture.yaml like this one."
+            "last two steps from the folder; for your own pictures and hand poses write a "
+            "capture.yaml like this one."
         ),
     ]
 

@@ -7,7 +7,7 @@ the projector on the columns of the whitened derivative ``A``. Every opinion is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -33,7 +33,6 @@ from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import point_jacobian, spot_on_beam
 from lasercal_gtsam.report_map import BEAM_TANGENT, CAMERA_TANGENT, PLANE_TANGENT, tangent_labels
-from lasercal_gtsam.rotations import rotation_exp
 
 Index = npt.NDArray[np.int64]
 Mask = npt.NDArray[np.bool_]
@@ -54,7 +53,7 @@ class Bench:
 
     Attributes
     ----------
-    observations : the spots used, input order; with stated robot noise at the likeliest hand poses
+    observations : the spots used, input order, with the hand poses that were given
     cell : the estimate
     labels : names of the free coordinates, m of them
     parts : (N, 2, 22) whitened derivative by each spot's own camera, laser and plane, per SI unit
@@ -62,7 +61,10 @@ class Bench:
     whitening : (N, 2, 2) ``W`` with ``W^T W`` the inverse covariance of a residual (1/px)
     batch : the spots that were used, of all that there are
     A : (2 N + P, m) whitened derivative by the free coordinates, P rows of priors at the end
-    r : (2 N + P,) whitened residuals, predicted minus seen
+    r : (2 N + P,) whitened residuals, predicted minus seen; with stated robot noise linearised at
+        the likeliest hand poses. All derivatives are those at the given poses: the likeliest ones
+        have the residuals in them, and directions that only their scatter tells apart would fit
+        every residual
     group : (N,) labels of equal plane and hand orientation
     orientation : (N,) labels of equal hand orientation
     exact : the residuals are rounding: there is no noise to judge by
@@ -99,7 +101,7 @@ class Bench:
         """(2 N + P,) residuals without the last bit that a further step would take away."""
         return np.asarray(self.r - self.Q @ (self.Q.T @ self.r))
 
-    @property
+    @cached_property
     def sse(self) -> float:
         """Sum of the squared whitened residuals; `dof` is what to expect."""
         return float(self.residuals @ self.residuals)
@@ -167,35 +169,32 @@ def lay_out(calibration: Calibration) -> Bench:
     )
     problem = problem.anchored(problem.start)
     cell = problem.start
-    batch, S, B, eta, unit = _whitened(calibration, cell)
+    given, S, residual, unit = _whitened(calibration, cell)
     exact = unit < _EXACT_PX
     unit = max(unit, _EXACT_PX)
     strength = np.sqrt(calibration.spots.weight) / unit
-    rows = batch.rows(state_from_cell(cell))[..., :-1] * strength[:, None, None]
+    rows = given.rows(state_from_cell(cell))[..., :-1] * strength[:, None, None]
     rows[..., 21] *= -1.0  # the kernels' offset of a plane is minus its distance
     w = whitening_from_covariance(S) * strength[:, None]
     W = np.zeros((len(seen), 2, 2))
     W[:, 0, 0], W[:, 0, 1], W[:, 1, 1] = w.T
-    residual = batch.residuals(state_from_cell(cell))
     if not np.isfinite(residual[used]).all():
         raise DataError(
             "some spots cannot be where the estimate has them (behind the camera, or the beam "
             "misses the plane): the calibration is not one"
         )
-    batch = batch.weighted(calibration.spots.weight > 0)
+    batch = given.weighted(calibration.spots.weight > 0)
     A, r = _system(problem, rows, np.einsum("nij,nj->ni", W, residual), batch)
-    kept, hands = seen[used], np.array(seen.T_base_hand[used])
-    hands[:, :3, 3] += eta[used, :3]
-    if eta.any():
-        hands[:, :3, :3] = hands[:, :3, :3] @ rotation_exp(eta[used, 3:])
+    kept = seen[used]
+    B, _ = linearized(kept, cell, np.zeros((len(used), 6)))
     return Bench(
-        observations=replace(kept, T_base_hand=hands),
+        observations=kept,
         cell=cell,
         labels=tuple(
             label for label, free in zip(tangent_labels(cell), problem.free, strict=True) if free
         ),
         parts=rows[used],
-        hand=(W @ B)[used],
+        hand=W[used] @ B,
         whitening=W[used],
         batch=batch,
         A=A,
@@ -217,28 +216,29 @@ def orientation_groups(
     return group_labels(observations.T_base_hand[:, :3, :3], plane, tolerance)
 
 
-def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, Array, float]:
-    """Spots with their whole covariance; it, the hand's derivative, corrections, and the scale."""
+def _whitened(calibration: Calibration, cell: Cell) -> tuple[SpotBatch, Array, Array, float]:
+    """Spots with their whole covariance, at the given hand poses; it, the residuals, the scale."""
     seen, options = calibration.inputs.observations, calibration.options_used
-    noise = HandNoise.of(options)
+    noise, state = HandNoise.of(options), state_from_cell(cell)
     unit = calibration.fit.sigma0
-    eta = np.zeros((len(seen), 6))
     if not noise.variances.any():
-        cov = pixel_covariances(seen, options.sigma_px)
-        B, _ = linearized(seen, cell, eta)
-        return make_batch(seen, options.sigma_px), cov, B, eta, unit
+        batch = make_batch(seen, options.sigma_px)
+        return batch, pixel_covariances(seen, options.sigma_px), batch.residuals(state), unit
     if options.sigma_px is None and np.isnan(seen.cov_uv).any():
         # the fit found the pixel sigma beside the stated noise of the hand: the scale is in it
         cov, unit = pixel_covariances(seen, unit), 1.0
     else:
         cov = pixel_covariances(seen, options.sigma_px)
+    as_given = np.zeros((len(seen), 6))
+    eta = as_given
     for _ in range(_HAND_ROUNDS):
         B, free = linearized(seen, cell, eta)
         aside = calibration.spots.weight <= 0
         eta = corrections(B, free, cov, noise, seen.shared_stops, aside)
-    B, _ = linearized(seen, cell, eta)
+    residual = corrected_batch(seen, cov, cell, noise, eta).residuals(state)
+    B, _ = linearized(seen, cell, as_given)
     S = cov + np.einsum("nij,j,nkj->nik", B, noise.variances, B)
-    return corrected_batch(seen, cov, cell, noise, eta), S, B, eta, unit
+    return corrected_batch(seen, cov, cell, noise, as_given), S, residual, unit
 
 
 def _system(

@@ -7,12 +7,12 @@ against it. Every threshold below is a named constant with its reason.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from lasercal_gtsam.calibration import Calibration
+from lasercal_gtsam.calibration import Calibration, SpotResults
 from lasercal_gtsam.check.picture import coverage, lines_of_spots
 from lasercal_gtsam.check.weakness import POOR, parts_in_words
 from lasercal_gtsam.errors import DataError
@@ -55,6 +55,9 @@ GROUP_SIZE = 4
 """Spots of a group from which on it is told that most of them were left out."""
 UNCHECKED = 1.9
 """Leverage (of 2) of a spot that the fit follows wherever it is."""
+MOST_SPOTS = 2000
+"""Spots of which the residuals are questioned: the noise of so many is known to 1 %, and the time
+that the questions take grows faster than their number."""
 WORTH_A_LOOK = 0.01
 """Chance of a fault from which on it is mentioned, without lowering the grade."""
 UNLIKELY = FAULT_CHANCE
@@ -85,6 +88,7 @@ class Opinions:
     left_out : groups as the others predict them
     tests : of the residuals
     split : the halves; None if not asked for
+    spots : how many spots they were asked of: of very many, an even sample
     """
 
     findings: tuple[Finding, ...] = ()
@@ -92,6 +96,7 @@ class Opinions:
     left_out: tuple[LeftOut, ...] = ()
     tests: tuple[ResidualTest, ...] = ()
     split: Split | None = None
+    spots: int = 0
 
 
 @dataclass(frozen=True)
@@ -112,13 +117,22 @@ class Verdict:
     opinions: Opinions
 
 
-def judge(calibration: Calibration, *, halves: bool = False) -> Verdict:
+def judge(
+    calibration: Calibration,
+    *,
+    halves: bool = False,
+    parts: tuple[Calibration, Calibration] | None = None,
+) -> Verdict:
     """Judge a calibration.
+
+    Of more than `MOST_SPOTS` spots the residuals are questioned on an even sample; the geometry,
+    the noise and the halves are those of all.
 
     Parameters
     ----------
     calibration : as `calibrate` returns it or `load_calibration` reads it
     halves : also calibrate two halves of the spots and compare them (two more fits)
+    parts : these halves, where they are at hand (`split.fit_halves`)
 
     Returns
     -------
@@ -137,7 +151,7 @@ def judge(calibration: Calibration, *, halves: bool = False) -> Verdict:
             words = "the residuals are rounding: there is no noise to judge by (simulated data?)"
             reasons.append(Reason("exact", "note", words, "Judge a real capture."))
         else:
-            opinions = _opinions(calibration, bench, halves)
+            opinions = _opinions(calibration, bench, halves or parts is not None, parts)
             reasons += _of_opinions(opinions)  # a named cause before its effect
             reasons += _of_noise(calibration, bench)
         reasons += _of_geometry(bench)
@@ -164,13 +178,44 @@ def _unheld(calibration: Calibration) -> Verdict:
     return Verdict("bad", (failed, reason), _LOOK, Opinions())
 
 
-def _opinions(calibration: Calibration, bench: Bench, halves: bool) -> Opinions:
+def _opinions(
+    calibration: Calibration,
+    bench: Bench,
+    halves: bool,
+    parts: tuple[Calibration, Calibration] | None,
+) -> Opinions:
+    compared = split(calibration, parts) if halves else None
+    if len(bench) > MOST_SPOTS:
+        bench = lay_out(_sample(calibration))
     return Opinions(
         accuse(bench),
         levels(bench),
         leave_groups_out(bench),
         question_residuals(bench),
-        split(calibration) if halves else None,
+        compared,
+        len(bench),
+    )
+
+
+def _sample(calibration: Calibration) -> Calibration:
+    """The same estimate with an even sample of its spots."""
+    used = np.flatnonzero(calibration.spots.weight > 0)
+    rows = used[np.linspace(0, len(used) - 1, MOST_SPOTS).round().astype(np.int64)]
+    spots, inputs = calibration.spots, calibration.inputs
+    leverage = spots.leverage
+    return replace(
+        calibration,
+        spots=SpotResults(
+            id=spots.id[rows],
+            plane=spots.plane[rows],
+            camera=spots.camera[rows],
+            laser=spots.laser[rows],
+            residual_px=spots.residual_px[rows],
+            weight=spots.weight[rows],
+            rejected=tuple(spots.rejected[k] for k in rows),
+            leverage=None if leverage is None else leverage[rows],
+        ),
+        inputs=replace(inputs, observations=inputs.observations[rows]),
     )
 
 

@@ -93,7 +93,7 @@ def gather(
         halves_trouble = str(error)
     return Material(
         calibration,
-        judge(calibration, halves=True),
+        judge(calibration, halves=True, parts=halves),
         bench,
         bench_trouble,
         halves,

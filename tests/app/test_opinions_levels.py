@@ -11,7 +11,9 @@ from lasercal_gtsam.opinions.bench import lay_out
 from lasercal_gtsam.opinions.groups import leave_groups_out
 from lasercal_gtsam.opinions.levels import levels
 from lasercal_gtsam.opinions.split import halves, split
+from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.simulate.noise import Noise
+from lasercal_gtsam.simulate.simulation import simulate
 
 QUIET = Noise(pixel_px=0.01)
 
@@ -132,3 +134,20 @@ def test_a_half_that_cannot_be_calibrated_is_said():
     assert found.failure is not None
     assert "half" in found.failure
     assert found.rows == ()
+
+
+def test_stated_robot_noise_does_not_fit_itself():
+    """A level must not take its derivatives where the residuals have already moved the hand."""
+    noise = Noise(0.03, 5e-5, 8.7e-5)
+    made = simulate("paper-distorted", 1, noise)
+    options = CalibrationOptions(
+        sigma_px=noise.pixel_px,
+        hand_sigma_m=noise.hand_translation_m,
+        hand_sigma_rad=noise.hand_rotation_rad,
+    )
+    found = levels(lay_out(calibrate(made.observations, initial=made.truth, options=options)))
+    plain = levels(lay_out(calibrate(made.observations, initial=made.truth)))
+    assert [level.dof for level in found] == [level.dof for level in plain]
+    for level in found:
+        assert 0.75 < level.rms_px / level.expected_px < 1.25, level.name
+        assert level.chance > 0.01, level.name
