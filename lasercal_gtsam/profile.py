@@ -43,8 +43,10 @@ _STEP = 1e-3
 # Gauss-Newton steps before Newton's, for these converge where the problem bends
 _FIRST_STEPS, _MAX_STEPS, _NEAR, _SETTLED, _SLOW = 6, 30, 0.3, 1e-3, 0.3
 _HALVINGS = 14
-# below this root the correction is 0 / 0 to rounding, and no end of an interval is there
-_SMALL_ROOT = 0.2
+# below this root the correction tends to 0 / 0, and no end of an interval of 2/3 or more is there
+_SMALL_ROOT = 0.9
+# Gauss-Newton step at which such a root is known well enough
+_ROUGH = 0.03
 _MAX_TRIES, _PRECISION, _FARTHEST = 25, 2e-3, 30.0
 
 
@@ -193,7 +195,7 @@ class RowProfile:
     def standing(self, value: float, start: Array | None = None) -> Standing | None:
         """How a value stands; None where it cannot be reached (the model folds or turns back).
 
-        Near the estimate (a root below 0.2) ``adjusted`` is the root itself.
+        Near the estimate (a root below 0.9) ``adjusted`` is the root itself.
         """
         found = self._held_at(value, np.zeros(self.likelihood.size) if start is None else start)
         if found is None:
@@ -202,7 +204,7 @@ class RowProfile:
         rise = self.likelihood.cost(w) - self.likelihood.cost(np.zeros(len(w)))
         below = math.copysign(1.0, -self._difference(value))
         root = below * math.sqrt(max(2.0 * rise, 0.0))
-        if abs(root) < _SMALL_ROOT:
+        if H is None or abs(root) < _SMALL_ROOT:
             return Standing(root, root, w)
         J0, e0, log_j = self.likelihood.at_estimate
         J, e = self.likelihood.rows(w)
@@ -255,14 +257,17 @@ class RowProfile:
     def _gradient(self, w: Array) -> Array:
         return self.row.gradient(self.likelihood.basis @ w) @ self.likelihood.basis
 
-    def _held_at(self, value: float, w: Array) -> tuple[Array, Array] | None:
-        """All else fitted again, and the Hessian of the Lagrangian there; None: not reached."""
+    def _held_at(self, value: float, w: Array) -> tuple[Array, Array | None] | None:
+        """All else fitted again, and the Hessian of the Lagrangian there; None: not reached.
+
+        No Hessian where the value is so near the estimate that none is needed.
+        """
         try:
             return self._minimised(value, w)
         except (LasercalError, np.linalg.LinAlgError):
             return None
 
-    def _minimised(self, value: float, w: Array) -> tuple[Array, Array] | None:
+    def _minimised(self, value: float, w: Array) -> tuple[Array, Array | None] | None:
         """Newton's method on the Lagrangian, begun by Gauss-Newton steps.
 
         Steps are shortened until the error with the violated constraint beside it falls.
@@ -271,6 +276,7 @@ class RowProfile:
         if not math.isfinite(cost):
             w = np.zeros(likelihood.size)
             cost = likelihood.cost(w)
+        small = likelihood.cost(np.zeros(likelihood.size)) + 0.5 * _SMALL_ROOT**2
         lagrangian: Array | None = None
         last = math.inf
         for count in range(_MAX_STEPS):
@@ -283,6 +289,8 @@ class RowProfile:
             length = float(np.linalg.norm(step))
             if lagrangian is not None and length < _SETTLED:
                 return w, lagrangian
+            if length < _ROUGH and cost < small:
+                return w, None
             # the Hessian is made anew where the last one does not lead on
             if (length < _NEAR or count >= _FIRST_STEPS) and length > _SLOW * last:
                 lagrangian = self._lagrangian(w, gradient, g)
