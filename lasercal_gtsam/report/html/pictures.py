@@ -28,6 +28,8 @@ WIDTH = 520.0
 _TALLEST = 430.0
 # beyond so many arrows or dots none can be pointed at: they share one path, without names
 _MOST_NAMED = 500
+# fields with less than this share of the usual number of spots: their mean is mostly noise
+_FEW_SHARE = 0.2
 _HEAD, _HEAD_SHARE, _HEAD_ANGLE = 6.0, 0.4, math.radians(24)
 _DOT = 2.4
 
@@ -67,12 +69,13 @@ def residual_vectors(image: Mapping[str, Any]) -> Markup:
         ]
     if image["bins"]:
         tails, steps = _columns(frame, image["bins"], image["bins_magnification"] * frame.scale)
+        few = _FEW_SHARE * np.median(image["bins"]["count"])
         inside += [
             element(
                 "path",
                 tooltip(f"mean of {count} spots: {_vector(du, dv)} px"),
                 d=arrow(tail, step),
-                class_="arrow mean",
+                class_="arrow mean pale" if count < few else "arrow mean",
             )
             for tail, step, count, du, dv in zip(
                 tails, steps, image["bins"]["count"], image["bins"]["du"], image["bins"]["dv"],
@@ -272,7 +275,7 @@ def _px(value: float) -> str:
 
 
 def _times(factor: float) -> str:
-    return f"{significant(factor, 3)} times as long"
+    return f"{factor:g} times as long" if factor < 1e6 else f"{significant(factor)} times as long"
 
 
 def _round_below(value: float) -> float:
