@@ -18,16 +18,17 @@ if TYPE_CHECKING:
 _MOST_LINES = 20
 
 
-def report_lines(plan: Plan, written: Path | None) -> list[str]:
+def report_lines(plan: Plan, written: Path | None, about: Mapping[str, Any]) -> list[str]:
     """What became of the stops, for people; ``written`` is None in a dry run."""
     shots = plan.shots
     planes = sorted({shot.plane for shot in shots})
     pairs = sum(shot.off is not None for shot in shots)
     lines = [
+        wrapped(_sources(about)),
         wrapped(
             f"{count(len(plan.stops), 'stop')}, {count(len(shots), 'row')} on "
             f"{count(len(planes), 'plane')} ({', '.join(planes)}); {pairs} with a laser-off picture"
-        )
+        ),
     ]
     if plan.left_out:
         lines.append(f"Left out ({len(plan.left_out)}):")
@@ -42,6 +43,17 @@ def report_lines(plan: Plan, written: Path | None) -> list[str]:
         f"{count(shot.n_pictures, 'picture')}"
         for shot in shots
     ]
+
+
+def _sources(about: Mapping[str, Any]) -> str:
+    if "bags" not in about:
+        return f"Pictures of {about['pictures']}, hand poses of {about['poses']}"
+    topics = about["images"]
+    cameras = [f"{topic} ({name})" if len(topics) > 1 else topic for name, topic in topics.items()]
+    return (
+        f"Pictures of {', '.join(cameras)}, hand poses {about['base']} <- {about['hand']} of "
+        f"{about['poses']}"
+    )
 
 
 def summary(plan: Plan, written: Path | None, about: Mapping[str, Any]) -> dict[str, Any]:

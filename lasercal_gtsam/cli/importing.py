@@ -18,7 +18,7 @@ from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
-    from lasercal_gtsam.recordings.bags import Bag
+    from lasercal_gtsam.recordings.bags import Bag, BagPictures
     from lasercal_gtsam.recordings.laser import LaserAt
     from lasercal_gtsam.recordings.motion import Motion
     from lasercal_gtsam.recordings.plan import Plan
@@ -161,7 +161,7 @@ def import_recording(**given: Any) -> None:
     if ask.as_json:
         print_json(summary(plan, written, recorded.about))
     else:
-        click.echo("\n".join(report_lines(plan, written)))
+        click.echo("\n".join(report_lines(plan, written, recorded.about)))
 
 
 @dataclass(frozen=True)
@@ -252,8 +252,17 @@ def _from_bag(ask: ImportRequest, bag: Bag) -> _Recorded:
         _planes(ask, bag, motion, sources),
         _laser(ask, bag),
         about,
-        tuple(clock_notes(bag.lags, list(topics.values()))),
+        (*clock_notes(bag.lags, list(topics.values())), *_lossy_notes(sources)),
     )
+
+
+def _lossy_notes(sources: Sequence[BagPictures]) -> list[str]:
+    return [
+        f"{source.name} was compressed as JPEG, which moves spots by some tenths of a pixel; "
+        "record the raw topic if you can"
+        for source in sources
+        if source.lossy
+    ]
 
 
 def _image_topics(ask: ImportRequest, bag: Bag) -> dict[str, str]:

@@ -248,10 +248,10 @@ class Bag:
         offset : added to the stamps, nanoseconds
         """
         self.check_topic(topic, IMAGE_TYPES, "image topic")
-        pairs = [
-            (self._stamp(message.header, received), received)
-            for received, message in self._messages([topic])
-        ]
+        pairs, formats = [], set()
+        for received, message in self._messages([topic]):
+            pairs.append((self._stamp(message.header, received), received))
+            formats.add(str(getattr(message, "format", "")).lower())
         if self._clock == "header" and any(stamp == 0 for stamp, _ in pairs):
             raise DataError(
                 f"{topic}: its messages have no stamp; use the time when they were received "
@@ -261,7 +261,8 @@ class Bag:
         first: dict[int, int] = {}
         for stamp, received in pairs:
             first.setdefault(stamp, received)
-        return BagPictures(self, topic, camera, sorted(first.items()), offset)
+        lossy = any("jpeg" in form or "jpg" in form for form in formats)
+        return BagPictures(self, topic, camera, sorted(first.items()), offset, lossy)
 
     def latched(self, topic: str, kind: str) -> tuple[Stamps, list[Any]]:
         """Values of a ``std_msgs`` topic and when they were received, in that order."""
@@ -330,13 +331,23 @@ class Bag:
 
 
 class BagPictures:
-    """Pictures of an image topic as a `PictureSource`; made by `Bag.pictures`."""
+    """Pictures of an image topic as a `PictureSource`; made by `Bag.pictures`.
+
+    ``lossy``: they were compressed as JPEG, which moves the centre of a spot.
+    """
 
     def __init__(
-        self, bag: Bag, topic: str, camera: str, times: Sequence[tuple[int, int]], offset: int
+        self,
+        bag: Bag,
+        topic: str,
+        camera: str,
+        times: Sequence[tuple[int, int]],
+        offset: int,
+        lossy: bool,
     ) -> None:
         self.camera = camera
         self.name = topic
+        self.lossy = lossy
         self._bag = bag
         self._times = list(times)
         self.stamps = as_stamps([stamp + offset for stamp, _ in times])

@@ -192,7 +192,7 @@ class _Chooser:
         self._done: list[Shot] = []
         self._pending: list[_Pending] = []
         self._offs: dict[tuple[str, str], list[tuple[int, int]]] = {}
-        self._without_picture: list[str] = []
+        self._without_picture: dict[str, list[str]] = {}
         self.left_out: list[str] = []
         self.notes: list[str] = []
 
@@ -202,7 +202,8 @@ class _Chooser:
         members = np.arange(lowest, highest)
         where = f"stop {number} ({self._times(stop)})"
         if not len(members):
-            self._without_picture.append(f"{number} ({self._times(stop)})")
+            missing = self._without_picture.setdefault(source.camera, [])
+            missing.append(f"{number} ({self._times(stop)})")
             return
         members, state, uniform = self._states(members, source)
         if isinstance(state, str):
@@ -269,10 +270,10 @@ class _Chooser:
                 if self._laser == "see"
                 else "there are no laser-off pictures"
             )
-        if self._without_picture:
-            self.notes.append(
-                f"{len(self._without_picture)} stops have no picture: {some(self._without_picture)}"
-            )
+        self.notes += [
+            f"{len(stops)} stops have no picture of {camera}: {some(stops)}"
+            for camera, stops in self._without_picture.items()
+        ]
         return sorted(self._done, key=lambda shot: (shot.stop, shot.camera))
 
     def _states(self, members: Stamps, source: PictureSource) -> tuple[Stamps, States | str, bool]:

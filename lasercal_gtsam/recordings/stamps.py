@@ -30,7 +30,8 @@ def ns_from_integer(text: str) -> int | None:
 
 def seconds_text(stamp: int) -> str:
     """A stamp in seconds with all its digits."""
-    return f"{stamp // NS_PER_S}.{stamp % NS_PER_S:09d}"
+    seconds, rest = divmod(abs(stamp), NS_PER_S)
+    return f"{'-' if stamp < 0 else ''}{seconds}.{rest:09d}"
 
 
 def duration_text(ns: float) -> str:

@@ -9,10 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cli_support import Cli
-from recording_cases import START, STORAGES, Session, picture, small_capture, write_bag
+from recording_cases import IMAGES, START, STORAGES, Session, picture, small_capture, write_bag
 
 from lasercal_gtsam.api import calibrate
+from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.capture import Capture, load_capture
+from lasercal_gtsam.recordings import OnePlane, open_bag, plan_capture, write_recording
 
 FRAMES = ("--base", "base_link", "--hand", "tool0")
 
@@ -142,6 +144,52 @@ def test_sixteen_bits_in_either_byte_order(lasercal, tmp_path):
     bag = recorded(tmp_path, deep, session, "ros1")
     assert lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane").status == 0
     assert_same(load_capture(out), deep)
+
+
+def test_jpeg_is_taken_with_a_warning(few, lasercal, tmp_path):
+    bag = recorded(tmp_path, few, Session(compressed="jpg"))
+    outcome = lasercal("import", bag, "--dry-run", *FRAMES, "--plane", "1")
+    assert outcome.status == 0
+    assert "/camera/image_raw was compressed as JPEG" in outcome.err
+
+
+def test_two_cameras(few, lasercal, tmp_path):
+    events = list(Session().events(few))
+    events += [
+        (at + 1, "/right/image_raw", kind, content)
+        for at, topic, kind, content in events
+        if topic == IMAGES and not START + 1_400_000_000 < content[0] < START + 2_800_000_000
+    ]
+    bag = write_bag(tmp_path / "bag", "mcap", events)
+    out = tmp_path / "out"
+    topics = ("--images", f"left={IMAGES}", "--images", "right=/right/image_raw")
+    outcome = lasercal("import", bag, "-o", out, *FRAMES, "--plane-topic", "/plane", *topics)
+    assert outcome.status == 0, outcome.err
+    assert "1 stops have no picture of right: 2 (1.55 to 2.25 s)" in outcome.err
+    found = load_capture(out)
+    rows = ["001_left", "001_right", "002_left", "003_left", "003_right", "004_left", "004_right"]
+    assert found.ids.tolist() == rows
+    assert found.cameras.tolist() == [name.partition("_")[2] for name in rows]
+    assert found.image_size == {"left": (160, 120), "right": (160, 120)}
+    np.testing.assert_array_equal(found.T_base_hand[0], found.T_base_hand[1])
+    unsaid = lasercal("import", bag, "--dry-run", *FRAMES, "--plane", "1")
+    assert unsaid.status == 1
+    assert "--images: give the image topic" in unsaid.err
+    assert f"{IMAGES}, /right/image_raw" in unsaid.err
+
+
+def test_in_python(few, tmp_path):
+    bag_path = recorded(tmp_path, few, Session())
+    with open_bag(bag_path) as bag:
+        motion = bag.hand_motion("base_link", "tool0")
+        cameras = [bag.pictures("/camera/image_raw")]
+        plan = plan_capture(motion, cameras, OnePlane("table"))
+        write_recording(tmp_path / "cell", plan, cameras)
+    np.testing.assert_allclose(
+        load_capture(tmp_path / "cell").T_base_hand, few.T_base_hand, rtol=0, atol=1e-14
+    )
+    with pytest.raises(DataError, match="the folder is not empty"):
+        write_recording(tmp_path / "cell", plan, cameras)
 
 
 # --- the laser ----------------------------------------------------------------------------------
