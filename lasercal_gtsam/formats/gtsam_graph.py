@@ -46,6 +46,8 @@ HELD_SIGMA = 1e-6
 # and the sigma it has instead, as a share of the sigmas of what is tied: enough to hold it, and not
 # so stiff that GTSAM's Cholesky decomposition fails.
 _NULL, TIED_SHARE = 1e-12, 1e-3
+# Rounding leaves eigenvalues of correlations below this under 0; less is a mistake.
+_NOT_A_COVARIANCE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +94,8 @@ class GtsamPrior:
         scale = np.sqrt(np.diag(covariance))
         correlation = covariance / np.outer(scale, scale)
         found, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
+        if found[0] < -_NOT_A_COVARIANCE:
+            raise DataError("the covariance has a negative eigenvalue: it is no covariance")
         tied = found < _NULL * float(found[-1])
         sigma = np.where(tied, TIED_SHARE, np.sqrt(np.abs(found)))
         return np.asarray((axes / sigma).T / scale)

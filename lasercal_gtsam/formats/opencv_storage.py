@@ -16,6 +16,7 @@ from lasercal_gtsam.formats.fields import decoded
 from lasercal_gtsam.formats.held import Held, Written
 from lasercal_gtsam.formats.ros_camera_info import pinhole
 from lasercal_gtsam.formats.source import Source, without_skew_term
+from lasercal_gtsam.formats.text import one_line
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.report_map import CAMERA_TANGENT
 
@@ -36,7 +37,7 @@ def write_storage(source: Source) -> Written:
     flags = cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     storage = cv2.FileStorage(".yaml", flags)
     for line in source.remarks:
-        storage.writeComment(" ".join(line.split()))
+        storage.writeComment(one_line(line))
     storage.write("image_width", camera.image_size[0])
     storage.write("image_height", camera.image_size[1])
     storage.write("camera_name", source.name)

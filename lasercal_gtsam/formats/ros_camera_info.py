@@ -7,6 +7,8 @@ of 0. ``K`` belongs to the raw picture; without rectification ``R`` is the ident
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 
 from lasercal_gtsam.cell import Intrinsics
@@ -80,9 +82,8 @@ def pinhole(K: Array, terms: Array) -> Intrinsics:
 
 
 def quoted(name: str) -> str:
-    """A YAML string that stays one, whatever is in it."""
-    escaped = name.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+    """A YAML string that stays one, whatever is in it: JSON's strings are YAML's too."""
+    return json.dumps(name, ensure_ascii=False)
 
 
 def _matrix(name: str, M: Array) -> str:

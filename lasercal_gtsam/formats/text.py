@@ -26,7 +26,12 @@ def numbers(values: Iterable[float] | Array, between: str = ", ") -> str:
 
 def comment(lines: Iterable[str], mark: str = "# ") -> str:
     """Lines of a comment, each with its mark in front and a newline behind."""
-    return "".join(f"{mark}{' '.join(line.split())}".rstrip() + "\n" for line in lines)
+    return "".join(f"{mark}{one_line(line)}".rstrip() + "\n" for line in lines)
+
+
+def one_line(text: str) -> str:
+    """Text on one line, with escapes for what cannot be printed."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in " ".join(text.split()))
 
 
 def xml_comment(lines: Iterable[str]) -> str:
