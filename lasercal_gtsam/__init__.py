@@ -47,6 +47,8 @@ _EXPORTS = {
     "to_gtsam": "formats.gtsam_graph",
 }
 
+_PACKAGES = ("study",)
+
 __all__ = [
     "Beam",
     "Calibration",
@@ -85,6 +87,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from lasercal_gtsam import study as study
     from lasercal_gtsam.api import calibrate
     from lasercal_gtsam.calibration import Calibration, Parameter
     from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
@@ -117,6 +120,8 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return import_module(f"{__name__}.{name}")
     if name not in _EXPORTS:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(f"{__name__}.{_EXPORTS[name]}"), name)

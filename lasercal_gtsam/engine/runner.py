@@ -70,6 +70,7 @@ def run_all(
     journal: str | Path | None = None,
     progress: Callable[[Progress], None] | None = None,
     chunk_seconds: float = CHUNK_SECONDS,
+    prepare: Callable[[], object] | None = None,
 ) -> Results:
     """Run everything that the journal does not hold yet.
 
@@ -81,6 +82,7 @@ def run_all(
         the new ones are run
     progress : called after each chunk
     chunk_seconds : how long a chunk should take
+    prepare : called before any worker begins, if there is anything to run
 
     Returns
     -------
@@ -99,6 +101,8 @@ def run_all(
     with nullcontext() if journal is None else Record(journal, work) as record:
         found = {} if record is None else {k: v for k, v in record.found.items() if k < work.runs}
         driver = _Driver(work, record, dict(found), progress, chunk_seconds)
+        if prepare is not None and len(found) < work.runs:
+            prepare()
         deaths = driver.finish(workers)
         values = tuple(driver.values[k] for k in range(work.runs))
     return Results(values, len(found), work.runs - len(found), deaths)

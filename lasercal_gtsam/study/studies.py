@@ -238,19 +238,10 @@ def _run(
     progress: Show | None,
 ) -> Results:
     work = Work(name, function, spec, runs)
-    if isinstance(workers, Processes):
-        compile_apart(work)
-    return run_all(work, workers, journal=journal, progress=progress)
-
-
-def compile_apart(work: Work) -> None:
-    """Let another process compile the kernels, so that every worker loads the same ones.
-
-    The process that compiles may get another last digit than those that load, and with it another
-    digest.
-    """
-    if work.runs:
-        apart(partial(work.function, work.spec, 0))
+    # The process that compiles the kernels may get another last digit than those that load them,
+    # and with it another digest: so another process compiles, and every worker loads.
+    first = partial(apart, partial(function, spec, 0)) if isinstance(workers, Processes) else None
+    return run_all(work, workers, journal=journal, progress=progress, prepare=first)
 
 
 def _check(trials: int, seed: int) -> None:
