@@ -9,6 +9,7 @@
   const stage = document.querySelector(".viewer");
   if (stage) cellViewer(stage, data.scene);
   followReader();
+  stopAtScrollable();
   openForPrint();
   copyPlainMinus();
   offerData();
@@ -20,6 +21,11 @@
     const R = scene.radius, D = EYE_DISTANCE * R, rad = Math.PI / 180;
     const home = { az: scene.view.azimuth_deg, el: scene.view.elevation_deg };
     const view = { ...home, zoom: 1, x: 0, y: 0 };
+    const words = {
+      base: () => "robot base", hand: n => `hand, spot ${n}`, camera: n => `camera ${n}`,
+      laser: n => `beam of laser ${n}`, plane: n => `plane ${n}`, spot: n => `spots on plane ${n}`,
+      rejected: n => `rejected spots on plane ${n}`, ellipsoid: n => `uncertainty, ${n}`,
+    };
     let held = false; // somebody has moved the scene: a new size of the window leaves it alone
     const visible = new Set(scene.layers.filter(l => l.visible).map(l => l.name));
     let width = 0, height = 0, fitted = 1, colours = {}, drawn = [], waiting = false;
@@ -236,11 +242,11 @@
         const { part, points, face } = drawn[i];
         if (!part.name || face) continue;
         const away = distance(event.offsetX, event.offsetY, points, part);
-        if (away < best) { best = away; name = part.name; }
+        if (away < best) { best = away; name = words[part.role](part.name); }
       }
       if (!name) {
         const under = drawn.filter(s => s.face && inside(event.offsetX, event.offsetY, s.points));
-        if (under.length) name = under[under.length - 1].part.name;
+        if (under.length) name = words.plane(under[under.length - 1].part.name);
       }
       tip.textContent = name;
       tip.style.display = name ? "block" : "none";
@@ -302,6 +308,17 @@
       }
     }, { rootMargin: "0px 0px -60% 0px" });
     for (const id of links.keys()) watch.observe(document.getElementById(id));
+  }
+
+  // the keyboard stops at a table only where there is something to scroll
+  function stopAtScrollable() {
+    const watch = new ResizeObserver(entries => {
+      for (const { target } of entries) {
+        if (target.scrollWidth > target.clientWidth) target.tabIndex = 0;
+        else target.removeAttribute("tabindex");
+      }
+    });
+    for (const part of document.querySelectorAll(".scroll, pre")) watch.observe(part);
   }
 
   // for browsers that cannot open details by style alone
