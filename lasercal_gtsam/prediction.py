@@ -68,8 +68,16 @@ def predict(
     (N, 2) and (N, 2, 2) arrays
         Pixels, and their covariance from the calibration alone (px^2). NaN where no spot can be.
     """
+    uv, J = spot_jacobian(known.cell, T_base_hand, plane, camera, laser)
+    columns = known.columns(camera, laser, plane)
+    return uv, _propagate(J, known.covariance[np.ix_(columns, columns)])
+
+
+def spot_jacobian(
+    cell: Cell, T_base_hand: Array, plane: str, camera: str, laser: str
+) -> tuple[Array, Array]:
+    """Pixels of the spot (N, 2) and their derivative (N, 2, 22) by camera, beam and plane."""
     T = np.asarray(T_base_hand, dtype=np.float64).reshape(-1, 4, 4)
-    cell = known.cell
     uv = project(cell, T, plane=plane, camera=camera, laser=laser)
     points = spot_on_beam(cell, T, plane=plane, laser=laser)
     J_point = point_jacobian(points, cell.cameras[camera])
@@ -81,8 +89,7 @@ def predict(
         ],
         axis=2,
     )
-    columns = known.columns(camera, laser, plane)
-    return uv, _propagate(J, known.covariance[np.ix_(columns, columns)])
+    return uv, J
 
 
 def locate(
@@ -103,9 +110,24 @@ def locate(
         Base points (metres) and their covariance (m^2; flat across the plane but for the plane's
         own uncertainty). NaN where the ray does not meet the plane.
     """
+    points, J, by_pixel = located_jacobian(known.cell, uv, plane, camera)
+    columns = known.columns(camera, None, plane)
+    cov = _propagate(J, known.covariance[np.ix_(columns, columns)])
+    return points, cov + sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, 1, 2)
+
+
+def located_jacobian(cell: Cell, uv: Array, plane: str, camera: str) -> tuple[Array, Array, Array]:
+    """Points of a plane seen at pixels, and their derivatives.
+
+    Returns
+    -------
+    (N, 3), (N, 3, 18) and (N, 3, 2) arrays
+        Base points (metres), derivative by camera and plane, derivative by the pixel. NaN where
+        the ray does not meet the plane.
+    """
     uv = np.asarray(uv, dtype=np.float64).reshape(-1, 2)
-    part, seen = known.cell.planes[plane], known.cell.cameras[camera]
-    points = spot_on_ray(known.cell, uv, plane=plane, camera=camera)
+    part, seen = cell.planes[plane], cell.cameras[camera]
+    points = spot_on_ray(cell, uv, plane=plane, camera=camera)
     # the point moves so that its pixel stays and it stays on the plane: M dX = rhs
     M = np.empty((len(uv), 3, 3))
     M[:, :2] = point_jacobian(points, seen)
@@ -117,12 +139,8 @@ def locate(
     seen_at = np.isfinite(points).all(axis=1)
     M[~seen_at] = np.eye(3)
     inverse = np.linalg.inv(M)
-    columns = known.columns(camera, None, plane)
-    cov = _propagate(inverse @ rhs, known.covariance[np.ix_(columns, columns)])
-    by_pixel = inverse[:, :, :2]
-    cov = cov + sigma_px**2 * by_pixel @ np.swapaxes(by_pixel, 1, 2)
-    cov[~seen_at] = np.nan
-    return points, cov
+    inverse[~seen_at] = np.nan
+    return points, inverse @ rhs, np.asarray(inverse[:, :, :2])
 
 
 def only(names: Sequence[str], given: str | None, kind: str) -> str:
