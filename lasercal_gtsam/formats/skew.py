@@ -10,6 +10,9 @@ from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.cell import Camera
 from lasercal_gtsam.errors import DataError
 
+# sigmas from 0 at which a skew is rather there than not
+_CLEARLY = 3.0
+
 
 def skew_cost_px(camera: Camera) -> float:
     """Largest change of a pixel of the image when the skew is dropped and nothing else moves (px).
@@ -90,10 +93,26 @@ def refit_without_skew(calibration: Calibration) -> tuple[Calibration, str]:
         raise DataError(f"fitted again with the skew held at 0: {again.fit.status}")
     told = [*(set(options.known) - set(known)), *(set(options.priors) - set(priors))]
     instead = f" (in place of what was stated of {', '.join(sorted(told))})" if told else ""
-    return again, (
+    moved = np.linalg.norm(again.spots.residual_px - calibration.spots.residual_px, axis=1)
+    words = (
         f"fitted again with the skew held at 0{instead}: RMS {fit.rms_px:.4g} px before, "
-        f"{again.fit.rms_px:.4g} px after"
+        f"{again.fit.rms_px:.4g} px after; the predicted spots move by up to "
+        f"{np.max(moved[np.isfinite(moved)], initial=0.0):.2g} px"
     )
+    return again, "; ".join([words, *_against(calibration)])
+
+
+def _against(calibration: Calibration) -> list[str]:
+    """Words where the spots do not agree with a skew of 0."""
+    words = []
+    for name, camera in calibration.cell.cameras.items():
+        skew, sigma = camera.intrinsics.skew, _skew_sigma(calibration, name)
+        if sigma > 0 and abs(skew) > _CLEARLY * sigma:
+            words.append(
+                f"the spots speak for a skew of {skew:.3g} +- {sigma:.2g} px of camera {name!r}: "
+                "the residuals, and with them the errors, are now systematic in part"
+            )
+    return words
 
 
 def _skew_sigma(calibration: Calibration, camera: str) -> float:

@@ -72,7 +72,12 @@ def test_refit_is_a_calibration_with_the_skew_held():
     np.testing.assert_allclose(
         found["T_base_camera"]["matrix"], wanted.T_base_camera, rtol=0, atol=1e-8
     )
-    assert "RMS" in done.notes[0]
+    seen = calibration.inputs.observations
+    planes = seen.plane.tolist()
+    shift = lc.project(again.cell, seen.T_base_hand, plane=planes) - lc.project(
+        calibration.cell, seen.T_base_hand, plane=planes
+    )
+    assert f"move by up to {np.linalg.norm(shift, axis=1).max():.2g} px" in done.notes[0]
     moved = wanted.intrinsics.u0 - calibration.cell.cameras[CAMERA].intrinsics.u0
     assert abs(moved) > 0.01
     for form in WITHOUT:
@@ -85,6 +90,8 @@ def test_refit_says_what_it_puts_aside():
     told = replace(calibration, inputs=replace(calibration.inputs, options=options))
     done = lc.export(told, "urdf", skew="refit")
     assert "in place of what was stated of skew" in done.notes[0]
+    assert "the spots speak for a skew of" in done.notes[0]
+    assert "speak for" not in lc.export(calibrated(skew_held=False), "urdf", skew="refit").notes[0]
 
 
 def test_refit_needs_the_spots():
