@@ -25,10 +25,10 @@ from scipy.optimize import nnls
 
 from lasercal_gtsam.frozen import Array
 
-_MAX_STEPS = 60
+_MAX_STEPS = 100
 _MAX_HALVINGS = 12
 # squared length of a scoring step, in standard errors, at which the components stand still
-_SETTLED = 1e-12
+_SETTLED = 1e-10
 # smallest change of the likelihood that is more than rounding, relative
 _ROUNDING = 1e-12
 # smallest variance of the information's correlation matrix that is not rounding
