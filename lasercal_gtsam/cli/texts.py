@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from lasercal_gtsam.cli.console import bullets, wrapped
 from lasercal_gtsam.report.words import count as count
-from lasercal_gtsam.report.words import noise_sentence
+from lasercal_gtsam.report.words import noise_sentence, sentence
 
 if TYPE_CHECKING:
     from lasercal_gtsam.calibration import Calibration
@@ -53,7 +53,7 @@ def result_lines(calibration: Calibration, table: str | None = None) -> list[str
         for spot in calibration.spots
         if spot.rejected is not None
     ]
-    lines = [table or calibration.table(), "", wrapped(_sentence(calibration.fit.status))]
+    lines = [table or calibration.table(), "", wrapped(sentence(calibration.fit.status))]
     lines.append(wrapped(noise_sentence(calibration)))
     lines += _section("Held or assumed:", observability.held)
     lines += _section(
@@ -72,10 +72,6 @@ def result_lines(calibration: Calibration, table: str | None = None) -> list[str
 
 def _section(heading: str, lines: Sequence[str]) -> list[str]:
     return [wrapped(heading), *bullets(lines)] if lines else []
-
-
-def _sentence(text: str) -> str:
-    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"
 
 
 def _cut(lines: Sequence[str], elsewhere: str) -> list[str]:

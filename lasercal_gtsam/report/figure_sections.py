@@ -16,7 +16,7 @@ from lasercal_gtsam.figures.residuals import MeanArrows, ResidualField, Residual
 from lasercal_gtsam.figures.scene import Scene
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.report.plainly import MM, PX, SHARE, M, number, numbers
-from lasercal_gtsam.report.words import count, size_words
+from lasercal_gtsam.report.words import count, sentence, size_words
 
 _MOST_PAIRS = 15
 _WIDEST_SCALE = 3.0
@@ -285,7 +285,7 @@ def _map(one: ErrorMap, halves_trouble: str) -> dict[str, Any]:
             "words": f"Root mean square {size_words(split.rms_mm)} mm {among}; the covariances of "
             f"the halves expect {size_words(split.expected_rms_mm)} mm.",
         },
-        "split_missing": None if split is not None else halves_trouble or "There are no halves.",
+        "split_missing": None if split is not None else sentence(halves_trouble or "no halves"),
         "alt": f"Map of expected error on {who}: median {size_words(one.median_mm)} mm and at most "
         f"{size_words(one.largest_mm)} mm {among}{outside}.",
         "split_alt": ""

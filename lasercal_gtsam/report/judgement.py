@@ -13,7 +13,7 @@ from lasercal_gtsam.opinions.levels import Level, LevelPart
 from lasercal_gtsam.opinions.suspects import Finding
 from lasercal_gtsam.report.material import Material
 from lasercal_gtsam.report.plainly import number
-from lasercal_gtsam.report.words import chance_words, noise_sentence
+from lasercal_gtsam.report.words import chance_words, noise_sentence, sentence
 
 _MOST_ROWS = 12
 _MOST_GROUPS = 40
@@ -112,6 +112,7 @@ def levels_section(material: Material) -> dict[str, Any]:
             "beam, so that planes do not count; free hand, the pose at each orientation is free; "
             "full chain, nothing is let off.",
             "Expected: what the noise gives there, given what the fit takes of it.",
+            *_sampled(material),
         ]
         if levels
         else [],
@@ -158,9 +159,17 @@ def levels_section(material: Material) -> dict[str, Any]:
     }
 
 
+def _sampled(material: Material) -> list[str]:
+    asked = material.verdict.opinions.spots
+    used = 0 if material.bench is None else len(material.bench)
+    if asked >= used:
+        return []
+    return [f"Asked of an even sample of {asked} of the {used} spots; the halves are all of them."]
+
+
 def _nothing(material: Material) -> str:
     if material.bench_trouble:
-        return material.bench_trouble
+        return sentence(material.bench_trouble)
     if material.bench is not None and material.bench.exact:
         return "The residuals are rounding: there is no noise to judge by."
     return "No level has degrees of freedom left to test anything."
@@ -247,7 +256,7 @@ def weak_section(material: Material) -> dict[str, Any]:
                 }
             )
     except LasercalError as error:
-        missing = f"The geometry could not be examined: {error}"
+        missing = sentence(f"the geometry could not be examined: {error}")
     if not len(calibration.inputs.observations):
         missing = "The calibration does not hold its spots, so their geometry is not known."
     words = (

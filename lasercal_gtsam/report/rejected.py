@@ -10,6 +10,8 @@ import numpy as np
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.figures.spots import Index
 from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.io.capture import Capture
+from lasercal_gtsam.io.spot_account import RowSpot
 from lasercal_gtsam.report.material import Material
 from lasercal_gtsam.report.plainly import PX, number, numbers
 from lasercal_gtsam.report.words import count, size_words
@@ -75,20 +77,19 @@ def _outlier(material: Material, k: int, thumbnails: _Thumbnails) -> dict[str, A
 
 
 def _rows(material: Material, thumbnails: _Thumbnails) -> tuple[list[dict[str, Any]], int | None]:
-    account, capture = material.account, material.capture
-    if account is None or capture is None:
+    """Rows of the capture that gave no usable spot, and their number; None without a capture."""
+    if material.capture is None:
         return [], None
-    skipped = [k for k, verdict in enumerate(account.verdict) if verdict != "used"]
+    skipped = _skipped(material.capture, material)
     rows = []
-    for k in skipped[:MOST_ROWS]:
-        row = account[k]
+    for k, row in skipped[:MOST_ROWS]:
         uv = np.array(row.uv)
         known = bool(np.isfinite(uv).all())
         rows.append(
             {
                 "id": row.id,
-                "plane": str(capture.planes[k]),
-                "camera": str(capture.cameras[k]),
+                "plane": str(material.capture.planes[k]),
+                "camera": str(material.capture.cameras[k]),
                 "verdict": row.verdict,
                 "why": row.reason,
                 "uv": numbers(uv, PX) if known else None,
@@ -96,6 +97,20 @@ def _rows(material: Material, thumbnails: _Thumbnails) -> tuple[list[dict[str, A
             }
         )
     return rows, len(skipped)
+
+
+def _skipped(capture: Capture, material: Material) -> list[tuple[int, RowSpot]]:
+    """Numbers and accounts of the rows without a usable spot."""
+    if material.account is not None:
+        return [(k, row) for k, row in enumerate(material.account) if row.verdict != "used"]
+    known = set(material.calibration.inputs.observations.id.tolist())
+    nowhere = (float("nan"), float("nan"))
+    why = "it is not among the spots of the calibration; 'lasercal detect' says what is wrong"
+    return [
+        (k, RowSpot(name, "no spot", why, "", nowhere))
+        for k, name in enumerate(capture.ids.tolist())
+        if name not in known
+    ]
 
 
 class _Thumbnails:

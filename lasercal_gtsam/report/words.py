@@ -55,6 +55,11 @@ def _level_words(level: NoiseLevel) -> str:
     return f"{what} {size_words(factor * level.value)} {unit} ({low} to {high})"
 
 
+def sentence(text: str) -> str:
+    """The text with a capital in front and a full stop behind."""
+    return f"{text[:1].upper()}{text[1:]}{'' if text.endswith('.') else '.'}"
+
+
 def count(number: int, noun: str) -> str:
     """``1 spot``, ``2 spots``."""
     return f"{number} {noun}" if number == 1 else f"{number} {noun}s"
