@@ -87,7 +87,7 @@ def intrinsics_options(command: Callable[..., int]) -> Callable[..., int]:
         multiple=True,
         help="A lens from elsewhere: ROS camera_info, Kalibr camchain, OpenCV FileStorage, mrcal "
         ".cameramodel, or a calibration or export of lasercal. FILE@cam1 takes one of several in a "
-        "file. Repeatable.",
+        "file. Repeatable; wins over capture.yaml, --known over it.",
     )
     @click.option(
         "--intrinsics-as",

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -135,6 +135,21 @@ class GtsamPrior:
         graph.add(self.factor)
         return graph
 
+    def rekeyed(self, keys: Sequence[int]) -> GtsamPrior:
+        """The same on other keys, given in the order of ``keys.keys``.
+
+        Raises
+        ------
+        DataError
+            Not as many keys as variables, or one twice.
+        """
+        if len(keys) != len(self.keys.keys) or len(set(keys)) < len(keys):
+            raise DataError(f"keys: expected {len(self.keys.keys)} different ones, got {[*keys]}")
+        given = iter(keys)
+        cameras = tuple((next(given), next(given)) for _ in self.cameras)
+        lasers = tuple(next(given) for _ in self.lasers)
+        return replace(self, keys=CellKeys(cameras, lasers, tuple(given), self.keys.frames))
+
     def covariance_of(self, *keys: int) -> Array:
         """Joint covariance of these keys' variables, in their order."""
         where = dict(zip(self.keys.keys, self.keys.columns, strict=True))
@@ -155,7 +170,7 @@ def to_gtsam(calibration: Calibration, parts: Sequence[str] | None = None) -> Gt
     -------
     GtsamPrior
         Keys are ``x0 k0 x1 k1 ...`` for the cameras, ``l0 ...`` and ``p0 ...`` for lasers and
-        planes, counted among the parts that are wanted.
+        planes, counted among the parts that are wanted; `GtsamPrior.rekeyed` gives others.
 
     Raises
     ------

@@ -113,25 +113,26 @@ def _from_json(text: str, name: str, camera: str | None) -> KnownIntrinsics:
     from lasercal_gtsam.io.cell_file import FORMATS, load_cell
 
     cell = load_cell(name, (*FORMATS, plain_data.FORMAT))
-    covariance = data.get("covariance") or {"labels": (), "matrix": ()}
-    labels = tuple(covariance["labels"])
-    matrix = [[np.nan if x is None else x for x in row] for row in covariance["matrix"]]
     try:
+        covariance = data.get("covariance") or {"labels": (), "matrix": ()}
+        labels = tuple(covariance["labels"])
+        matrix = [[np.nan if x is None else x for x in row] for row in covariance["matrix"]]
         return _from_cell(cell, labels, np.array(matrix, dtype=np.float64), name, camera)
-    except (TypeError, ValueError, IndexError):
+    except (TypeError, ValueError, IndexError, KeyError):
         raise DataError(f"{name}: covariance: expected labels and a square matrix") from None
 
 
 def _from_npz(content: bytes, name: str, camera: str | None) -> KnownIntrinsics:
     try:
         held = plain_data.read_npz(content)
-    except (ValueError, KeyError, OSError, EOFError, BadZipFile, DataError) as error:
+        cameras = {
+            k: Camera(lens, held.poses[k], held.image_size[k])
+            for k, lens in held.intrinsics.items()
+        }
+        covariance: Any = held.covariance
+        return _from_cell(Cell(cameras, {}), held.labels, covariance, name, camera)
+    except (TypeError, ValueError, LookupError, OSError, EOFError, BadZipFile) as error:
         raise DataError(f"{name}: not an export of the format npz: {error}") from None
-    cameras = {
-        k: Camera(lens, held.poses[k], held.image_size[k]) for k, lens in held.intrinsics.items()
-    }
-    covariance: Any = held.covariance
-    return _from_cell(Cell(cameras, {}), held.labels, covariance, name, camera)
 
 
 def _from_cell(

@@ -86,7 +86,7 @@ def fields_of(content: bytes, name: str) -> Fields:
     try:
         tree = ast.parse(decoded(content, name), mode="eval").body
         model: Any = ast.literal_eval(tree)
-    except (ValueError, SyntaxError, MemoryError, RecursionError) as error:
+    except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
         line = getattr(error, "lineno", None)
         at = name if line is None else f"{name}:{line}"
         raise DataError(f"{at}: not a cameramodel, which is a Python literal") from None

@@ -147,7 +147,8 @@ def _covariance(storage: Any, name: str) -> Array | None:
     labels, matrix = storage.getNode("covariance_labels"), storage.getNode("covariance")
     if labels.empty() or matrix.empty():
         return None
-    found = tuple(labels.at(i).string() for i in range(labels.size()))
+    nodes = [labels.at(i) for i in range(labels.size())]
+    found = tuple(node.string() if node.isString() else "" for node in nodes)
     values = _mat(matrix)
     if found != CAMERA_TANGENT or values is None or values.shape != (15, 15):
         raise DataError(f"{name}: covariance: expected 15 x 15 of {', '.join(CAMERA_TANGENT)}")
@@ -155,14 +156,16 @@ def _covariance(storage: Any, name: str) -> Array | None:
 
 
 def _size(storage: Any, name: str) -> tuple[int, int] | None:
-    found = [next((n for key in keys if not (n := storage.getNode(key)).empty()), None)
-             for keys in (_WIDTH, _HEIGHT)]  # fmt: skip
-    if found[0] is None or found[1] is None:
-        return None
-    width, height = (node.real() for node in found if node is not None)
-    if not (width > 0 and height > 0 and width == int(width) and height == int(height)):
-        raise DataError(f"{name}: image size: expected whole numbers above 0: {width}, {height}")
-    return int(width), int(height)
+    found = []
+    for keys in (_WIDTH, _HEIGHT):
+        nodes = [node for key in keys if not (node := storage.getNode(key)).empty()]
+        if not nodes:
+            return None
+        value = nodes[0].real() if nodes[0].isInt() or nodes[0].isReal() else 0.0
+        if not (value > 0 and value == int(value)):
+            raise DataError(f"{name}: {keys[0]}: expected a whole number of pixels above 0")
+        found.append(int(value))
+    return found[0], found[1]
 
 
 def _mat(node: Any) -> Any:

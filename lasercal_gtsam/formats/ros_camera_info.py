@@ -54,7 +54,7 @@ def intrinsics_of(fields: Fields) -> tuple[Intrinsics, tuple[int, int], str]:
     size = fields.size("image_width", "image_height")
     K = fields.matrix("camera_matrix", (3, 3))
     model = fields.text("distortion_model")
-    count = len(D) if (D := fields.matrix("distortion_coefficients")) is not None else 0
+    D = fields.matrix("distortion_coefficients")
     if model in _OTHER_MODELS:
         fields.add(
             "distortion_model",
@@ -62,8 +62,8 @@ def intrinsics_of(fields: Fields) -> tuple[Intrinsics, tuple[int, int], str]:
         )
     elif model is not None and model != PLUMB_BOB:
         fields.add("distortion_model", f"expected {PLUMB_BOB}, got {model!r}")
-    elif D is not None and count != 5:
-        fields.add("distortion_coefficients", f"expected 5 (k1, k2, p1, p2, k3), got {count}")
+    elif D is not None and len(D) != 5:
+        fields.add("distortion_coefficients", f"expected 5 (k1, k2, p1, p2, k3), got {len(D)}")
     elif D is not None and D[4] != 0:
         fields.add("distortion_coefficients", f"k3 = {D[4]:g}: our model has none, it must be 0")
     for key in ("binning_x", "binning_y"):
