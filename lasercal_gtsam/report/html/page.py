@@ -75,6 +75,7 @@ def _environment() -> Environment:
         still_scene=scene.still_scene,
     )
     environment.filters.update(
+        by_meaning=_by_meaning,
         by_part=_by_part,
         by_sigma=_by_sigma,
         category=palettes.category,
@@ -117,6 +118,14 @@ def _embedded(document: Mapping[str, Any]) -> Markup:
 
 def _by_part(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, list[Mapping[str, Any]]]]:
     return [(part, list(of)) for part, of in groupby(rows, key=lambda row: row["part"])]
+
+
+def _by_meaning(rows: Sequence[Mapping[str, Any]]) -> list[tuple[list[str], str]]:
+    """What rows mean, once for all that mean the same, in the order of the first ones."""
+    names: dict[str, list[str]] = {}
+    for row in rows:
+        names.setdefault(row["meaning"], []).append(row["name"])
+    return [(of, meaning) for meaning, of in names.items()]
 
 
 def _places(rows: Sequence[Mapping[str, Any]], column: str) -> int:
