@@ -8,6 +8,7 @@ calls the two keys ``lens_model`` and ``extrinsics`` (mrcal/cameramodel.py): bot
 from __future__ import annotations
 
 import ast
+import warnings
 from typing import Any
 
 import numpy as np
@@ -83,8 +84,11 @@ def read_model(content: bytes) -> Held:
 
 def fields_of(content: bytes, name: str) -> Fields:
     """Keys of a model, old names made new; `DataError` where the file is none."""
+    text = decoded(content, name)
     try:
-        tree = ast.parse(decoded(content, name), mode="eval").body
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of odd literals, on its way to refusing them
+            tree = ast.parse(text, mode="eval").body
         model: Any = ast.literal_eval(tree)
     except (ValueError, TypeError, SyntaxError, MemoryError, RecursionError) as error:
         line = getattr(error, "lineno", None)
