@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -152,10 +152,14 @@ def import_recording(**given: Any) -> None:
         _check_is_bag(ask.recording)
         show_bag(ask.recording, ask.stamps, ask.as_json)
         return
-    with progress("Looking at stops") as show, _opened(ask) as recorded:
-        plan = _plan(ask, recorded, show)
-        if not ask.dry_run:
-            _write(ask, recorded, plan)
+    with ExitStack() as stack:
+        folder = None
+        if ask.output is not None and not ask.dry_run:  # refused before the work, not after it
+            folder = stack.enter_context(capture_folder(ask.output, ask.force))
+        recorded = stack.enter_context(_opened(ask))
+        plan = _plan(ask, recorded)
+        if folder is not None:
+            _write(folder, recorded, plan)
     written = None if ask.dry_run else ask.output
     warn(plan.notes)
     if ask.as_json:
@@ -314,26 +318,24 @@ def _laser(ask: ImportRequest, bag: Bag) -> LaserAt | Literal["see", "on"]:
     return latched_laser(*bag.latched(ask.laser_topic, "Bool"))
 
 
-def _plan(ask: ImportRequest, recorded: _Recorded, show: Any) -> Plan:
-    from dataclasses import replace
-
+def _plan(ask: ImportRequest, recorded: _Recorded) -> Plan:
     from lasercal_gtsam.recordings.plan import plan_capture
 
-    plan = plan_capture(
-        recorded.motion,
-        recorded.sources,
-        recorded.planes,
-        laser=recorded.laser,
-        limits=ask.limits,
-        every_picture=ask.every_picture or ask.names == "order",
-        progress=show,
-    )
+    with progress("Looking at stops") as show:
+        plan = plan_capture(
+            recorded.motion,
+            recorded.sources,
+            recorded.planes,
+            laser=recorded.laser,
+            limits=ask.limits,
+            every_picture=ask.every_picture or ask.names == "order",
+            progress=show,
+        )
     return replace(plan, notes=(*recorded.notes, *plan.notes))
 
 
-def _write(ask: ImportRequest, recorded: _Recorded, plan: Plan) -> None:
+def _write(folder: Path, recorded: _Recorded, plan: Plan) -> None:
     from lasercal_gtsam.recordings.write import write_recording
 
-    assert ask.output is not None
-    with progress("Writing pictures") as show, capture_folder(ask.output, ask.force) as folder:
+    with progress("Writing pictures") as show:
         write_recording(folder, plan, recorded.sources, origin=recorded.about, progress=show)

@@ -128,9 +128,9 @@ def plan_capture(
         be read, or nothing is left.
     """
     limits = StillLimits() if limits is None else limits
-    origin = origin_of(motion, sources)
     for source in sources:
         _check_overlap(motion, source)
+    origin = origin_of(motion, sources)
     if every_picture:
         stamps = np.unique(np.concatenate([source.stamps for source in sources]))
         stops = stops_of_pictures(motion, stamps, limits)

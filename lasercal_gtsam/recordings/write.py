@@ -17,6 +17,7 @@ from lasercal_gtsam.io.plain import plain, to_json
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.recordings.plan import Plan, Shot
 from lasercal_gtsam.recordings.sources import PictureSource
+from lasercal_gtsam.recordings.stamps import NS_PER_S
 
 RECORDING_FILE = "recording.json"
 RECORDING_FORMAT = "lasercal-recording"
@@ -117,7 +118,7 @@ def _document(plan: Plan, origin: Mapping[str, Any]) -> dict[str, Any]:
                 "id": shot.id,
                 "stop": shot.stop,
                 "stop_s": [
-                    (t - plan.origin) * 1e-9
+                    (t - plan.origin) / NS_PER_S
                     for t in (plan.stops[shot.stop - 1].first, plan.stops[shot.stop - 1].last)
                 ],
                 "stamp_ns": shot.stamp,

@@ -355,6 +355,21 @@ def test_usage(args, words, bags, lasercal):
     assert words in outcome.err
 
 
+def test_a_capture_is_not_overwritten_and_an_error_leaves_nothing(bags, lasercal, tmp_path):
+    out = tmp_path / "out"
+    args = ("import", bags["mcap"], "-o", out, *FRAMES, "--plane", "1", "--laser-on")
+    assert lasercal(*args, "--images", "/nothing").status == 1
+    assert not out.exists() or not any(out.iterdir())
+    assert lasercal(*args).status == 0
+    (out / "mine.txt").write_text("kept")
+    again = lasercal(*args)
+    assert again.status == 1
+    assert "the folder is not empty" in again.err
+    assert lasercal(*args, "--force").status == 0
+    assert (out / "mine.txt").read_text() == "kept"
+    load_capture(out)
+
+
 def test_list_shows_topics_cameras_and_frames(bags, lasercal, tmp_path):
     outcome = lasercal("import", bags["sqlite3"], "--list")
     assert outcome.status == 0

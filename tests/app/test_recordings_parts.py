@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
+
 import cv2
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from lasercal_gtsam.recordings.encodings import (
 )
 from lasercal_gtsam.recordings.laser import OFF, ON, UNKNOWN, most_central, spot_appears, states_of
 from lasercal_gtsam.recordings.motion import Motion, PoseSeries, chain, pose_series
-from lasercal_gtsam.recordings.stamps import duration_text, ns_from_seconds, seconds_text
+from lasercal_gtsam.recordings.plan import plan_capture
+from lasercal_gtsam.recordings.planes import OnePlane
+from lasercal_gtsam.recordings.stamps import as_stamps, duration_text, ns_from_seconds, seconds_text
 from lasercal_gtsam.recordings.stops import StillLimits, find_stops, stops_of_pictures
 from lasercal_gtsam.recordings.tree import TransformTree
 
@@ -152,6 +156,47 @@ def test_every_picture_mode_joins_pictures_of_one_pose():
         (2 * 10**9, 4 * 10**9),
         (5 * 10**9, 5 * 10**9),
     ]
+
+
+class CountedSource:
+    """A camera whose pictures are made when asked for: on in the first half of each second."""
+
+    camera, name = "camera", "counted"
+
+    def __init__(self, count: int, every: int) -> None:
+        self.stamps = as_stamps(START + every * np.arange(count))
+        self.reads: list[int] = []
+
+    def read(self, which: Sequence[int]) -> Iterator[tuple[int, np.ndarray]]:
+        self.reads.append(len(which))
+        for k in which:
+            lit = (self.stamps[k] - START) % 1_000_000_000 < 500_000_000
+            yield k, scene(80 if lit else 0, seed=k)
+
+
+def test_long_stops_are_sampled_not_loaded():
+    t = np.arange(400) * 0.01
+    motion = moving_along_x(np.where(t < 2.0, 0.0, 0.1 * (t - 2.0)))
+    source = CountedSource(800, 5 * MS)
+    progress: list[tuple[int, int]] = []
+    plan = plan_capture(
+        motion, [source], OnePlane("table"), progress=lambda *done: progress.append(done)
+    )
+    assert source.reads == [9]
+    assert progress == [(1, 1)]
+    (shot,) = plan.shots
+    assert shot.n_pictures == pytest.approx(340, abs=4)  # 0.15 to 1.85 s at 200 Hz
+    assert (shot.stamp - START) % 1_000_000_000 < 500_000_000
+    assert (shot.off_stamp - START) % 1_000_000_000 >= 500_000_000
+
+
+def test_pictures_without_a_pose_are_counted():
+    motion = moving_along_x(np.array([0.0, 0.1, 0.2]), every=10**9)
+    source = CountedSource(5, 10**9)
+    plan = plan_capture(motion, [source], OnePlane("a"), every_picture=True, laser="on")
+    assert [shot.stamp for shot in plan.shots] == source.stamps[:3].tolist()
+    assert plan.notes[-1].startswith("2 pictures are left out: the hand's pose is not known")
+    assert source.reads == []
 
 
 # --- frames -------------------------------------------------------------------------------------
