@@ -47,8 +47,8 @@ FINE = 0.006 * IMAGE_DIAGONAL
 # area of a picture of 4:3, with which the chance of an agreement is reckoned
 _IMAGE_AREA = 0.48 * IMAGE_DIAGONAL**2
 _CHANCE = 1e-2
-_DIRECTIONS, _KEPT, _DISTINCT_RAD = 300, 8, 6.0 * RAD_PER_DEG
-_SEARCHED_GROUPS, _FOURS, _THREES = 12, 210, 120
+_DIRECTIONS, _KEPT, _DISTINCT_RAD = 250, 8, 6.0 * RAD_PER_DEG
+_SEARCHED_GROUPS, _SEARCHED_FOURS, _FOURS, _THREES = 12, 120, 210, 120
 _LINES = 8
 _POLISHED = 2
 # two scores nearer than this are the same consensus, found twice
@@ -116,7 +116,8 @@ class _Consensus:
 
         some = _of_all_planes(self.groups, _SEARCHED_GROUPS)
         groups = self.groups.subset(some)
-        shots, counts = self.fours.shots[some], self.fours.counts[some]
+        shots = self.fours.shots[some]
+        counts = np.minimum(self.fours.counts[some], _SEARCHED_FOURS)
         u = hemisphere(_DIRECTIONS)
         scores = np.empty(len(u))
         for i, s in enumerate(across_beam(groups, u)):

@@ -50,6 +50,9 @@ PLAUSIBLE_NEGATIVE = 0.02
 PLAUSIBLE_RMS = 0.02
 """Root mean square distance in image diagonals; strong distortion, ignored here, gives half."""
 
+GROSS = 0.0125 * IMAGE_DIAGONAL
+"""Rms distance of shots from the homographies of their groups that only outliers explain."""
+
 
 @dataclass(frozen=True, eq=False)
 class PairCandidate:
@@ -72,7 +75,8 @@ def solve_pair(
     """Closed-form solutions of one pair, best first.
 
     Directions come from the groups; where there are none, or where what they give is implausible,
-    from the search without groups, unless ``search`` is False.
+    from the search without groups. With ``search`` False there is none, and nothing is solved where
+    shots of the groups lie far from any homography: for spots among which may be outliers.
 
     Raises
     ------
@@ -83,7 +87,9 @@ def solve_pair(
     flat = planes_seen_flat(spots)
     groups = groups.subset(np.flatnonzero(~np.isin(groups.plane, flat)))
     planes = [plane for plane in scaled_planes(spots) if plane.index not in flat]
-    directions, _ = robust_directions(groups)
+    directions, costs = robust_directions(groups)
+    if not search and len(costs) and costs[0] > GROSS**2:
+        raise DegenerateError("the spots of groups of non-rotating motions do not fit each other")
     reasons: list[str] = []
     found = _ranked(solutions_from_groups(spots, groups, directions, known, reasons), spots)
     found += _ranked(

@@ -123,7 +123,13 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
     if isinstance(plain, Finished) and clean and plain.solution.plausible:
         return Accepted(plain, accept, ways.starts[0])
     best = _from_starts(search, ways, plain)
-    if ways.parts is not None and not clean and not settles_it(search, best):
+    settled = settles_it(search, best)
+    if best is not None and plain is None and settled and not _named(search, best).any():
+        plain = _plain(search, ways, finish)  # the starts were suspicious, the spots are not
+        clean = isinstance(plain, Finished) and looks_clean(search, plain.lengths)
+        if isinstance(plain, Finished) and clean and plain.solution.plausible:
+            return Accepted(plain, accept, ways.starts[0])
+    if ways.parts is not None and not clean and not settled:
         best = best_of_parts(search, ways.parts, best)
     if best is not None:
         answer = refit(search, best, ways.refine, finish, ways.starts)
@@ -161,6 +167,12 @@ def _from_starts(
     return best
 
 
+def _named(search: Search, found: Consensus) -> Mask:
+    """Spots that a consensus takes for outliers at first sight."""
+    nobody = np.zeros(len(found.lengths), dtype=np.bool_)
+    return outliers(found.lengths, unknowns_of(search), nobody)
+
+
 def _doubted(search: Search, finished: Finished, rejected: Mask) -> Finished:
     """The answer, with a trouble where it is not one that half of the spots fit."""
     unknowns = unknowns_of(search)
@@ -180,7 +192,7 @@ def _doubted(search: Search, finished: Finished, rejected: Mask) -> Finished:
         )
     else:
         return finished
-    troubles = (*finished.solution.troubles, trouble)
+    troubles = (trouble, *finished.solution.troubles)
     return finished._replace(solution=replace(finished.solution, troubles=troubles))
 
 
@@ -211,8 +223,7 @@ def refit(
         A camera, laser or plane would be left without spots.
     """
     unknowns = unknowns_of(search)
-    rejected = np.zeros(len(search.batch), dtype=np.bool_)
-    found = outliers(best.lengths, unknowns, rejected)
+    found = _named(search, best)
     cell, iterations, full = best.cell, best.iterations, False
     answer: tuple[Finished, Mask] | None = None
     for _ in range(2 * _ROUNDS):

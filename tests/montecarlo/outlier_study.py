@@ -1,19 +1,22 @@
 """Outliers of any share, found from the data alone: distance from the clean spots' optimum.
 
-``python tests/montecarlo/outlier_study.py --robust auto --spots 90 --seeds 200`` prints the table:
-for each share of outliers, anywhere in the picture or on one ghost (the pixel of a fixed specular
-reflection), how often the answer is within half a sigma (rms over all unknowns) of the optimum of
-the clean spots, and precision and recall of the spots named.
+``python tests/montecarlo/outlier_study.py outliers.jsonl --seeds 200`` runs it, one line of a file
+for each capture, and prints the table: for each share of outliers, anywhere in the picture or on
+one ghost (the pixel of a fixed specular reflection), how often the answer is within half a sigma
+(rms over all unknowns) of the optimum of the clean spots, and precision and recall of the spots
+named. Begun again it goes on where it was.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -120,18 +123,19 @@ def rms_sigmas(found: lc.Calibration, clean: lc.Calibration) -> float:
     return distance if np.isfinite(distance) else float("inf")
 
 
-def clean_optima(
-    seen: lc.Observations, truth: lc.Cell, options: lc.CalibrationOptions
-) -> list[lc.Calibration]:
-    """Least squares on clean spots, from the truth and from no start.
+def distance_from_clean(
+    found: lc.Calibration, seen: lc.Observations, truth: lc.Cell, options: lc.CalibrationOptions
+) -> float:
+    """`rms_sigmas` from least squares on the clean spots, begun at the truth or without a start.
 
     The two differ where the distortion has two minima that fit equally well (now and then, with 90
     spots): either is what the clean spots give.
     """
-    found = [lc.calibrate(seen, initial=truth, options=options)]
-    with suppress(lc.LasercalError):
-        found.append(lc.calibrate(seen, options=options))
-    return found
+    distance = rms_sigmas(found, lc.calibrate(seen, initial=truth, options=options))
+    if distance > REACHED:
+        with suppress(lc.LasercalError):
+            distance = min(distance, rms_sigmas(found, lc.calibrate(seen, options=options)))
+    return distance
 
 
 def outcome_of(
@@ -148,9 +152,9 @@ def outcome_of(
         return Outcome(float("inf"), 0, 0, int(spoiled.sum()), False, seconds, refusal)
     seconds = time.process_time() - begin
     named = np.array([reason is not None for reason in found.spots.rejected])
-    optima = clean_optima(seen[~spoiled], _truth(spots, seed), replace(options, robust="none"))
+    plain = replace(options, robust="none")
     return Outcome(
-        min(rms_sigmas(found, clean) for clean in optima),
+        distance_from_clean(found, seen[~spoiled], _truth(spots, seed), plain),
         int((named & spoiled).sum()),
         int((named & ~spoiled).sum()),
         int((~named & spoiled).sum()),
@@ -169,8 +173,8 @@ def outlier_study(
     distortion: str = "all",
 ) -> Tally:
     """Captures of the paper's cell with 90 or 900 spots, a share of them outliers of that kind."""
-    options = lc.CalibrationOptions(robust=robust, distortion=distortion)
-    return Tally(tuple(outcome_of(spots, share, kind, seed, options, sigma_px) for seed in seeds))
+    cases = [Case(spots, kind, share, seed, robust, distortion, sigma_px) for seed in seeds]
+    return Tally(tuple(case.run() for case in cases))
 
 
 @cache
@@ -179,27 +183,76 @@ def _truth(spots: int, seed: int) -> lc.Cell:
     return simulate("paper", seed, groups=groups, shots=shots).truth
 
 
-def table_row(share: float, kind: str, tally: Tally, first: int) -> str:
+def table_row(share: float, kind: str, tally: Tally, seeds: Sequence[int]) -> str:
     """One line of the study's table, and the seeds that were not reached."""
     far = [
-        f"{first + i}{'' if o.converged else '*'}"
-        for i, o in enumerate(tally.outcomes)
+        f"{seed}{'' if o.converged else '*'}"
+        for seed, o in zip(seeds, tally.outcomes, strict=True)
         if o.distance > REACHED
     ]
     seconds = np.array([o.seconds for o in tally.outcomes])
     distances = np.array([o.distance for o in tally.outcomes])
     return (
         f"{100 * share:3.0f} % {kind:8} reached {100 * tally.reached:5.1f} %  "
-        f"median {np.median(distances):.3f} sigma  silent {tally.silent}  "
+        f"median {np.median(distances):.3f} most {distances.max():.3f} sigma  "
+        f"silent {tally.silent}  "
         f"precision {tally.precision:.4f}  recall {tally.recall:.4f}  "
         f"{np.median(seconds):.2f} s  far: {' '.join(far) or 'none'}"
     )
 
 
+@dataclass(frozen=True)
+class Case:
+    """One capture of the study."""
+
+    spots: int
+    kind: str
+    share: float
+    seed: int
+    robust: str
+    distortion: str
+    pixel: float
+
+    def run(self) -> Outcome:
+        options = lc.CalibrationOptions(robust=self.robust, distortion=self.distortion)
+        return outcome_of(self.spots, self.share, self.kind, self.seed, options, self.pixel)
+
+
+def read_outcomes(path: Path) -> dict[Case, Outcome]:
+    """What a file of `keep` holds."""
+    lines = path.read_text().splitlines() if path.exists() else []
+    rows = [json.loads(line) for line in lines]
+    return {Case(**row["case"]): Outcome(**row["outcome"]) for row in rows}
+
+
+def run_into(path: Path, cases: Iterable[Case]) -> None:
+    """Run what the file does not hold yet, one line for each as it goes."""
+    known = read_outcomes(path)
+    with path.open("a") as file:
+        for case in cases:
+            if case not in known:
+                row = {"case": asdict(case), "outcome": asdict(case.run())}
+                print(json.dumps(row), file=file, flush=True)
+
+
+def print_table(outcomes: dict[Case, Outcome]) -> None:
+    """A line for each number of spots, kind and share, over the seeds there are."""
+    print("(seeds with * were refused or not called converged; seconds of processor time)")
+    cells: dict[tuple[str, str, float, int, str, float], list[tuple[int, Outcome]]] = {}
+    for case, outcome in outcomes.items():
+        key = (case.robust, case.distortion, case.pixel, case.spots, case.kind, case.share)
+        cells.setdefault(key, []).append((case.seed, outcome))
+    for (robust, distortion, pixel, spots, kind, share), found in sorted(cells.items()):
+        seeds, results = zip(*sorted(found, key=lambda pair: pair[0]), strict=True)
+        head = f"{robust}, distortion {distortion}, {pixel:g} px, {spots} spots, {len(seeds)} seeds"
+        print(f"{head}: {table_row(share, kind, Tally(tuple(results)), seeds)}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--robust", default="auto")
-    parser.add_argument("--spots", type=int, default=90, choices=[90, 900])
+    parser.add_argument("file", type=Path, help="JSON lines; what it holds is not run again")
+    parser.add_argument("--robust", nargs="+", default=["auto"])
+    parser.add_argument("--spots", type=int, nargs="+", default=[90, 900], choices=[90, 900])
     parser.add_argument("--seeds", type=int, default=200)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--pixel", type=float, default=1.0, help="px")
@@ -207,17 +260,18 @@ def main() -> None:
     parser.add_argument("--shares", type=float, nargs="+", default=SHARES)
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     given = parser.parse_args()
-    seeds = range(given.first, given.first + given.seeds)
-    print(f"paper, {given.spots} spots, {given.pixel} px, {given.robust}, {given.seeds} seeds")
-    print("(seeds with * were refused or not called converged)")
-    for kind in given.kinds:
-        for share in given.shares:
-            if share == 0.0 and kind != given.kinds[0]:
-                continue
-            tally = outlier_study(
-                given.spots, share, kind, seeds, given.robust, given.pixel, given.distortion
-            )
-            print(table_row(share, kind, tally, given.first), flush=True)
+    run_into(
+        given.file,
+        (
+            Case(spots, kind, share, seed, robust, given.distortion, given.pixel)
+            for seed in range(given.first, given.first + given.seeds)
+            for spots in given.spots
+            for share in given.shares
+            for kind in (given.kinds if share > 0 else given.kinds[:1])
+            for robust in given.robust
+        ),
+    )
+    print_table(read_outcomes(given.file))
 
 
 if __name__ == "__main__":
