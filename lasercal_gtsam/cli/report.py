@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.io.capture import Capture
     from lasercal_gtsam.io.spot_account import SpotAccount
     from lasercal_gtsam.report.material import Origin
+    from lasercal_gtsam.report.table import Intervals
 
 REPORT_FILE = "report.html"
 _PAGE = b"<!doctype html"
@@ -46,8 +47,20 @@ _PAGE = b"<!doctype html"
     help="The capture it was made from, for pictures of spots that were left out.  [default: the "
     "one beside the calibration, if it has not changed since]",
 )
+@click.option(
+    "--intervals",
+    type=click.Choice(["sigma", "likelihood"]),
+    default="sigma",
+    show_default=True,
+    help="Where the 95 % intervals come from: sigma, even about the answer; likelihood, right also "
+    "where the problem bends (few spots, all distortion terms), some tenths of a second a row.",
+)
 def report(
-    calibration: Path, output: Path | None, document: Path | None, capture: Path | None
+    calibration: Path,
+    output: Path | None,
+    document: Path | None,
+    capture: Path | None,
+    intervals: str,
 ) -> int:
     """Write the report of CALIBRATION (calibration.json): one HTML file, to be read anywhere.
 
@@ -65,7 +78,8 @@ def report(
     origin = Origin.of_file(calibration)
     found = _capture(capture, calibration.parent, origin)
     account = None if found is None else _account(found, loaded)
-    write(loaded, target, origin, found, account, document)
+    ends = _by_likelihood(loaded) if intervals == "likelihood" else None
+    write(loaded, target, origin, found, account, document, ends)
     click.echo(f"Saved {target}." if document is None else f"Saved {target} and {document}.")
     return 0
 
@@ -77,6 +91,7 @@ def write(
     capture: Capture | None,
     account: SpotAccount | None,
     document: Path | None = None,
+    intervals: Intervals | None = None,
 ) -> None:
     """Write the page, and the document where that is wanted."""
     from lasercal_gtsam.report.file import report as save
@@ -88,7 +103,21 @@ def write(
         origin=origin,
         capture=capture,
         account=account,
+        intervals=intervals,
     )
+
+
+def _by_likelihood(calibration: Calibration) -> Intervals:
+    """95 % intervals of all rows that were estimated; `DataError` where there can be none."""
+    from lasercal_gtsam.intervals import intervals
+
+    names = [p.name for p in calibration.parameters if p.sigma > 0]
+    found: dict[str, tuple[float, float]] = {}
+    with progress("Following the likelihood") as show:
+        for done, name in enumerate(names, start=1):
+            found |= intervals(calibration, [name])
+            show(done, len(names))
+    return found
 
 
 def report_target(output: Path | None, folder: Path) -> Path:

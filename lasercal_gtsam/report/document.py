@@ -40,7 +40,7 @@ from lasercal_gtsam.report.judgement import (
 )
 from lasercal_gtsam.report.material import Material, Origin, gather
 from lasercal_gtsam.report.rejected import rejected_section
-from lasercal_gtsam.report.table import parameters_section
+from lasercal_gtsam.report.table import Intervals, parameters_section
 
 FORMAT = "lasercal-report"
 VERSION = 1
@@ -52,6 +52,7 @@ def make_document(
     origin: Origin | None = None,
     capture: Capture | None = None,
     account: SpotAccount | None = None,
+    intervals: Intervals | None = None,
     created: datetime | None = None,
 ) -> dict[str, Any]:
     """Everything that the report shows, as plain dicts, lists, strings and numbers.
@@ -62,6 +63,7 @@ def make_document(
     origin : where it came from, as far as known
     capture : what it was made from, for pictures of the spots that were left out
     account : what became of the capture's rows (`Capture.detections`)
+    intervals : 95 % intervals of the rows (`lasercal_gtsam.intervals`); None: those by sigma
     created : time to note; None: now (UTC)
 
     Returns
@@ -81,7 +83,7 @@ def make_document(
         "language": "en",
         "summary": summary(material, maps),
         "verdict": verdict_section(material),
-        "parameters": parameters_section(calibration),
+        "parameters": parameters_section(calibration, intervals),
         "rejected": rejected_section(material),
         "residuals": residuals_section(
             calibration,

@@ -229,9 +229,9 @@ def error_section(
         "words": [
             "How far a point is off, root mean square, that is located on the plane from an exact "
             "pixel (calibration.locate). Add the noise of the pixel itself where it has any. "
-            "Right: the same from data, half the distance between the answers of two calibrations "
-            "from half the spots each. It is one draw of what the left side expects, so that the "
-            "pattern may differ, but not the size."
+            "Beside it the same from data: half the distance between the answers of two "
+            "calibrations from half the spots each. It is one draw of what the first map expects, "
+            "so that the pattern may differ, but not the size."
         ]
         if maps
         else [],

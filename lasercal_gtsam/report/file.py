@@ -15,6 +15,7 @@ from lasercal_gtsam.report.material import Origin
 if TYPE_CHECKING:
     from lasercal_gtsam.io.capture import Capture
     from lasercal_gtsam.io.spot_account import SpotAccount
+    from lasercal_gtsam.report.table import Intervals
 
 
 def report(
@@ -25,6 +26,7 @@ def report(
     origin: Origin | None = None,
     capture: Capture | None = None,
     account: SpotAccount | None = None,
+    intervals: Intervals | None = None,
 ) -> None:
     """Write the uncertainty report, one HTML file that needs no network.
 
@@ -36,13 +38,16 @@ def report(
     origin : where the calibration came from, as far as known (`Origin.of_file`)
     capture, account : what it was made from, and what became of the capture's rows: for pictures of
         the spots that were left out
+    intervals : 95 % intervals of the rows (`lasercal_gtsam.intervals`); None: those by sigma
 
     Raises
     ------
     DataError
         A file cannot be written.
     """
-    made = make_document(calibration, origin=origin, capture=capture, account=account)
+    made = make_document(
+        calibration, origin=origin, capture=capture, account=account, intervals=intervals
+    )
     page = render(made)
     if document is not None:
         write_text(document, to_json(made) + "\n")

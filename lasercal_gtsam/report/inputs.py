@@ -20,6 +20,7 @@ _OPTIONS = {
     "sigma_px": "pixel sigma of spots without one of their own; none: from the residuals",
     "hand_sigma_m": "robot noise of a hand position, metres a coordinate",
     "hand_sigma_rad": "robot noise of a hand orientation, radians an axis",
+    "estimate_noise": "levels of the robot's noise that are found from the residuals",
     "robust": "what is done about outliers",
     "distortion": "distortion terms that are estimated",
     "known": "held at these values",
@@ -115,6 +116,8 @@ def _calibrate(options: CalibrationOptions, capture: str, file: str) -> str | No
     ):
         return None
     words = ["lasercal", "calibrate", capture]
+    if options.estimate_noise:
+        words.append("--estimate-noise")
     if options.distortion != default.distortion:
         terms = options.distortion
         words += ["--distortion", terms if isinstance(terms, str) else ",".join(terms)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -52,10 +52,21 @@ _LASER = {
 _PLANE = "The plane's vector: its unit normal times its distance from the base's origin (eq. 4)."
 
 
-def parameters_section(calibration: Calibration) -> dict[str, Any]:
-    """Rows with sigma and interval, and what the interval is."""
+Intervals = Mapping[str, tuple[float, float]]
+
+
+def parameters_section(
+    calibration: Calibration, intervals: Intervals | None = None
+) -> dict[str, Any]:
+    """Rows with sigma and interval, and what the interval is.
+
+    ``intervals``: 95 % intervals of all rows that were estimated (`lasercal_gtsam.intervals`), to
+    be printed instead of those by sigma.
+    """
     factor, distribution = interval_factor(calibration.fit.dof)
     known = any(p.sigma > 0 for p in calibration.parameters)
+    if intervals is not None:
+        factor, distribution = float("nan"), "likelihood"
     who = zip(calibration.parameters, _owners(calibration), strict=True)
     return {
         "heading": "Parameters",
@@ -65,7 +76,7 @@ def parameters_section(calibration: Calibration) -> dict[str, Any]:
             "correlations before using one sigma alone.",
         ],
         "missing": None,
-        "rows": [_row(p, part, said, factor) for p, (part, said) in who],
+        "rows": [_row(p, part, said, _ends(p, factor, intervals)) for p, (part, said) in who],
         "interval": {
             "level": LEVEL,
             "distribution": distribution if known else None,
@@ -91,7 +102,21 @@ def interval_factor(dof: float, level: float = LEVEL) -> tuple[float, str]:
     return float(stdtrit(dof, tail)), "t"
 
 
+def _ends(p: Parameter, factor: float, intervals: Intervals | None) -> tuple[float, float]:
+    """Low and high end of a row's interval; NaN where it has none."""
+    if not p.sigma > 0:
+        return float("nan"), float("nan")
+    if intervals is not None:
+        return intervals[p.name]
+    return p.refined - factor * p.sigma, p.refined + factor * p.sigma
+
+
 def _interval_words(dof: float, factor: float, distribution: str) -> str:
+    if distribution == "likelihood":
+        return (
+            "95 % interval: from the likelihood, all other rows free, so that it need not lie "
+            "evenly about the answer. It covers noise, not a model that is wrong."
+        )
     if not np.isfinite(factor):
         return "There are no degrees of freedom left, so no sigmas and no intervals."
     name = (
@@ -105,10 +130,11 @@ def _interval_words(dof: float, factor: float, distribution: str) -> str:
     )
 
 
-def _row(p: Parameter, part: str, said: tuple[str, str, str], factor: float) -> dict[str, Any]:
+def _row(
+    p: Parameter, part: str, said: tuple[str, str, str], ends: tuple[float, float]
+) -> dict[str, Any]:
     label, frame, meaning = said
     held = p.sigma == 0
-    half = factor * p.sigma if p.sigma > 0 else float("nan")
     _, initial, refined, sigma, _ = table_row(p)
     decimals = table_decimals(p)
     return {
@@ -120,18 +146,22 @@ def _row(p: Parameter, part: str, said: tuple[str, str, str], factor: float) -> 
         "initial": number(p.initial, 12),
         "refined": number(p.refined, 12),
         "sigma": number(p.sigma),
-        "low": number(p.refined - half, 12),
-        "high": number(p.refined + half, 12),
+        "low": number(ends[0], 12),
+        "high": number(ends[1], 12),
         "held": held,
         "meaning": meaning,
         "text": {
             "initial": initial,
             "refined": refined,
             "sigma": sigma,
-            "low": plain_number(p.refined - half, decimals),
-            "high": plain_number(p.refined + half, decimals),
+            "low": _end_text(ends[0], decimals),
+            "high": _end_text(ends[1], decimals),
         },
     }
+
+
+def _end_text(value: float, decimals: int) -> str:
+    return "no bound" if np.isinf(value) else plain_number(value, decimals)
 
 
 def _owners(calibration: Calibration) -> Iterator[tuple[str, tuple[str, str, str]]]:

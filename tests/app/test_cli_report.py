@@ -125,6 +125,23 @@ def test_nothing_that_is_not_ours_is_overwritten(lasercal, folder):
         document_of(lasercal, calibration)
 
 
+def test_intervals_by_the_likelihood_are_asked_for_every_row(lasercal, folder, monkeypatch):
+    asked = []
+
+    def ends(calibration, names):
+        asked.extend(names)
+        return {name: (1.0, 2.0) for name in names}
+
+    assert lasercal("calibrate", folder).status == 0
+    monkeypatch.setattr("lasercal_gtsam.intervals.intervals", ends)
+    calibration = folder / "calibration.json"
+    document, _ = document_of(lasercal, calibration, "--intervals", "likelihood")
+    rows = document["parameters"]["rows"]
+    assert asked == [row["name"] for row in rows if not row["held"]]
+    assert {(row["low"], row["high"]) for row in rows} == {(1.0, 2.0)}
+    assert "likelihood" in document["parameters"]["interval"]["words"]
+
+
 def test_mistakes_are_one_line(lasercal, tmp_path):
     outcome = lasercal("report", tmp_path / "none.json")
     assert outcome.status == 1

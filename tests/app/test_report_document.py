@@ -150,6 +150,20 @@ def test_intervals_are_students_and_normal_where_that_is_the_same():
     assert document_of(no_freedom)["parameters"]["interval"]["factor"] is None
 
 
+def test_intervals_from_elsewhere_take_the_place_of_those_by_sigma():
+    found = one_plane()
+    given = {p.name: (p.refined - 1.0, p.refined + 2.0) for p in found.parameters if p.sigma > 0}
+    given["k2"] = (-np.inf, found["k2"].refined + 2.0)
+    section = made(found, intervals=given)["parameters"]
+    assert section["interval"]["distribution"] == "likelihood"
+    assert section["interval"]["factor"] is None
+    rows = {row["name"]: row for row in section["rows"]}
+    assert rows["fu"]["high"] - rows["fu"]["low"] == pytest.approx(3.0)
+    assert rows["k2"]["low"] is None
+    assert rows["k2"]["text"]["low"] == "no bound"
+    assert rows["u0"]["text"]["low"] == ""  # held
+
+
 def test_an_interval_holds_the_truth_as_often_as_it_says():
     """Few degrees of freedom, where the normal distribution would hold it 92 times in 100."""
     from lasercal_gtsam.simulate import simulate
