@@ -51,46 +51,56 @@ def with_intrinsics(
         Unknown cameras, pictures of another size, no sigmas for priors.
     """
     check_given(observations, given, how)
-    if how == "start":
-        return options, ()
-    if how == "known":
-        known = dict(options.known)
-        for name, lens in given.items():
-            prefix = _prefix(observations, name)
-            # what names the same numbers in other words
-            for other in ("principal_point", "aspect"):
-                known.pop(prefix + other, None)
-            known |= {prefix + k: float(getattr(lens.intrinsics, k)) for k in INTRINSIC_NAMES}
-        return replace(options, known=known), ()
-    known, priors = dict(options.known), dict(options.priors)
     words: list[str] = []
     for name, lens in given.items():
         prefix = _prefix(observations, name)
-        from_file, factor = prior_sigmas(lens)
-        found = {**from_file, **(sigmas or {})}
-        if missing := [row for row in ROWS if row not in found]:
-            raise DataError(
-                f"{lens.path}: a {lens.form} file without a covariance: a prior needs a sigma for "
-                f"{', '.join(missing)} (--intrinsics-sigma NAME=SIGMA); or take it as known, or as "
-                "a start"
-            )
-        stated = _stated(options, prefix)
-        if unused := [row for row, t in zip(ROWS, INTRINSIC_NAMES, strict=True) if t in stated]:
-            words.append(f"{lens.path}: {', '.join(unused)} not used: known already")
-        for row, term in zip(ROWS, INTRINSIC_NAMES, strict=True):
-            if term in stated:
-                continue
-            value = getattr(lens.intrinsics, "alpha_c" if row == "alpha_c" else term)
-            if found[row] > 0:
-                priors.setdefault(prefix + row, (float(value), found[row]))
-            else:
-                known[prefix + term] = float(getattr(lens.intrinsics, term))
-        if factor > 1:
-            words.append(
-                f"{lens.path}: the priors are independent, so that the file's sigmas are widened "
-                f"{factor:.2g} times: together they claim no more than its covariance"
-            )
-    return replace(options, known=known, priors=priors), tuple(words)
+        if how == "known":
+            options = _held(options, prefix, lens)
+        elif how == "prior":
+            options, more = _with_priors(options, prefix, lens, sigmas or {})
+            words += more
+    return options, tuple(words)
+
+
+def _held(options: CalibrationOptions, prefix: str, lens: KnownIntrinsics) -> CalibrationOptions:
+    # what names the same numbers in other words must go
+    other = {prefix + "principal_point", prefix + "aspect"}
+    known = {name: value for name, value in options.known.items() if name not in other}
+    known |= {prefix + name: float(getattr(lens.intrinsics, name)) for name in INTRINSIC_NAMES}
+    return replace(options, known=known)
+
+
+def _with_priors(
+    options: CalibrationOptions, prefix: str, lens: KnownIntrinsics, sigmas: Mapping[str, float]
+) -> tuple[CalibrationOptions, list[str]]:
+    from_file, factor = prior_sigmas(lens)
+    found = {**from_file, **sigmas}
+    stated = _stated(options, prefix)
+    wanted = {
+        row: term for row, term in zip(ROWS, INTRINSIC_NAMES, strict=True) if term not in stated
+    }
+    if missing := [row for row in wanted if row not in found]:
+        raise DataError(
+            f"{lens.path}: a {lens.form} file without a covariance: a prior needs a sigma for "
+            f"{', '.join(missing)} (--intrinsics-sigma NAME=SIGMA); or take it as known, or as a "
+            "start"
+        )
+    known, priors = dict(options.known), dict(options.priors)
+    for row, term in wanted.items():
+        if found[row] > 0:
+            mean = getattr(lens.intrinsics, "alpha_c" if row == "alpha_c" else term)
+            priors.setdefault(prefix + row, (float(mean), found[row]))
+        else:
+            known[prefix + term] = float(getattr(lens.intrinsics, term))
+    words = []
+    if unused := [row for row in ROWS if row not in wanted]:
+        words.append(f"{lens.path}: {', '.join(unused)} not used: known already")
+    if factor > 1:
+        words.append(
+            f"{lens.path}: the priors are independent, so that the file's sigmas are widened "
+            f"{factor:.2g} times: together they claim no more than its covariance"
+        )
+    return replace(options, known=known, priors=priors), words
 
 
 def start_with_intrinsics(

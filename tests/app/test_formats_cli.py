@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,7 +176,7 @@ def test_a_lens_is_a_prior(cli, folder, lenses, tmp_path):
     options = [word for pair in sigmas for word in ("--intrinsics-sigma", pair)]
     stated, _ = calibrate(
         cli, folder, tmp_path, "--intrinsics", lenses / "ros.yaml", "--intrinsics-as", "prior",
-        "--intrinsics-sigma", "alpha_c=0.001", *options,
+        *options,
     )  # fmt: skip
     assert 0 < stated["fu"].sigma < 1.1
 
@@ -210,3 +211,9 @@ def test_wrong_lenses_are_refused(cli, folder, lenses, tmp_path, args, status, w
     assert outcome.status == status
     assert words in outcome.err
     assert not (tmp_path / "x.json").exists()
+
+
+def test_the_page_on_formats_has_every_format():
+    page = (Path(__file__).parents[2] / "docs" / "formats.md").read_text()
+    table = [line for line in page.splitlines() if line.startswith("| `")]
+    assert {word for line in table for word in line.split("`")[1::2]} >= set(FORMATS)
