@@ -24,6 +24,7 @@ from lasercal_gtsam.cli.export import export
 from lasercal_gtsam.cli.history import history
 from lasercal_gtsam.cli.importing import import_recording
 from lasercal_gtsam.cli.judge import judge
+from lasercal_gtsam.cli.plan import plan
 from lasercal_gtsam.cli.report import report
 from lasercal_gtsam.cli.simulate import simulate
 from lasercal_gtsam.cli.study import study
@@ -63,6 +64,7 @@ for _command in (
     history,
     export,
     simulate,
+    plan,
     study,
     demo,
 ):

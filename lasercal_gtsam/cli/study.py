@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
+from lasercal_gtsam.cli.values import Numbers
 from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
@@ -107,6 +108,7 @@ def study() -> None:
 @_cell_options
 @click.option(
     "--levels",
+    type=Numbers(),
     metavar="A,B,...",
     default="0,0.2,0.4,0.6,0.8,1",
     show_default=True,
@@ -140,7 +142,7 @@ def fig6(
     as_json: bool,
     cell: Path | None,
     design: str | None,
-    levels: str,
+    levels: tuple[float, ...],
     planes: str | None,
     groups: int | None,
     shots: int | None,
@@ -166,7 +168,7 @@ def fig6(
     )
     settings = {
         "trials": trials,
-        "levels": _numbers(levels, "--levels"),
+        "levels": levels,
         "cell": chosen,
         "methods": [m for m in METHODS if m[:2] in families],
         "seed": seed,
@@ -179,6 +181,7 @@ def fig6(
 @_cell_options
 @click.option(
     "--samples",
+    type=Numbers(),
     metavar="A,B,...",
     default="30,60,120,180,240,300",
     show_default=True,
@@ -201,7 +204,7 @@ def fig7(
     as_json: bool,
     cell: Path | None,
     design: str | None,
-    samples: str,
+    samples: tuple[float, ...],
     sigma_px: float,
 ) -> None:
     """Error of the focal length on one, two and three planes, closed form and refined.
@@ -221,12 +224,11 @@ def fig7(
         cases = {f"plane {p}": StudyCell(cell=own, planes=(p,), design=design) for p in own.planes}
         if len(own.planes) > 1:
             cases[f"{len(own.planes)} planes"] = StudyCell(cell=own, design=design)
-    counts = _numbers(samples, "--samples")
-    if any(n != int(n) for n in counts):
-        raise click.UsageError(f"--samples: expected whole numbers, got {samples!r}")
+    if any(n != int(n) for n in samples):
+        raise click.UsageError(f"--samples: expected whole numbers, got {samples}")
     settings = {
         "trials": trials,
-        "samples": [int(n) for n in counts],
+        "samples": [int(n) for n in samples],
         "cases": cases,
         "pixel_px": sigma_px,
         "seed": seed,
@@ -394,10 +396,3 @@ def _cell(path: Path | None) -> Cell | None:
 
 def _names(text: str) -> list[str]:
     return [part.strip() for part in text.split(",") if part.strip()]
-
-
-def _numbers(text: str, option: str) -> list[float]:
-    try:
-        return [float(part) for part in _names(text)]
-    except ValueError:
-        raise click.UsageError(f"{option}: expected numbers between commas, got {text!r}") from None

@@ -105,6 +105,30 @@ def _setting(name: str, text: str, default: Any) -> Any:
     return int(text) if isinstance(default, int) else float(text)
 
 
+class Numbers(_ParamType):
+    """Numbers between commas: so many of them, or any number where ``count`` is None."""
+
+    name = "numbers"
+
+    def __init__(self, count: int | None = None) -> None:
+        self.count = count
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, ...]:
+        """Split at the commas."""
+        if isinstance(value, tuple):
+            return value
+        wanted = "numbers" if self.count is None else f"{self.count} numbers"
+        try:
+            found = tuple(float(part) for part in str(value).split(",") if part.strip())
+        except ValueError:
+            self.fail(f"expected {wanted} between commas, got {value!r}", param, ctx)
+        if not all(map(math.isfinite, found)) or len(found) != (self.count or len(found)):
+            self.fail(f"expected {wanted} between commas, got {value!r}", param, ctx)
+        return found
+
+
 class PresetName(_ParamType):
     """Name of a simulated cell."""
 

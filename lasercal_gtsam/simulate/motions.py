@@ -219,7 +219,7 @@ def _draw_starts(
 
     posture = rotation_from_zyx(0.0, 0.0, np.pi)
     roll = rng.uniform(-design.roll, design.roll, _BATCH)
-    turn = _shortest_turns(posture @ beam.direction_hand, direction)
+    turn = shortest_turns(posture @ beam.direction_hand, direction)
     R = rotation_exp(roll[:, None] * direction) @ turn @ posture
     length = rng.uniform(*design.beam_length, _BATCH)
     t = spots - length[:, None] * direction - R @ beam.point_hand
@@ -275,7 +275,7 @@ def _random_rotations(rng: np.random.Generator, count: int) -> Array:
     return np.asarray(Q * diagonal[:, None, :])
 
 
-def _shortest_turns(start: Array, ends: Array) -> Array:
+def shortest_turns(start: Array, ends: Array) -> Array:
     """Shortest rotations that take the unit vector ``start`` to each of ``ends`` (N, 3)."""
     across = np.cross(start, ends)
     sin, cos = np.linalg.norm(across, axis=-1), ends @ start

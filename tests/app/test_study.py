@@ -277,7 +277,7 @@ def test_the_figures_are_drawn(tmp_path):
 @pytest.mark.parametrize(
     ("args", "status", "message"),
     [
-        (["fig6", "--levels", "a"], 2, "--levels: expected numbers between commas, got 'a'"),
+        (["fig6", "--levels", "a"], 2, "expected numbers between commas, got 'a'"),
         (["fig6", "--methods", "M7"], 2, "--methods: 'M7' is not one of M1"),
         (["fig7", "--samples", "30.5"], 2, "expected whole numbers"),
         (["table2", "--tests", "5"], 2, "--tests: '5' is not one of 1, 2, 3, 4"),
