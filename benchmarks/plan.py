@@ -20,7 +20,7 @@ from lasercal_gtsam.plan import Limits, Plan, plan, procedure
 from lasercal_gtsam.plan.design import Problem
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "app"))
-from test_plan import random_cell  # noqa: E402
+from test_plan import random_cell
 
 
 def in_view(made: Plan) -> bool:
