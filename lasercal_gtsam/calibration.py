@@ -328,9 +328,14 @@ def table_row(p: Parameter) -> tuple[str, str, str, str, str]:
 
 def table_decimals(p: Parameter) -> int:
     """How many decimals a row is printed with."""
-    if not (np.isfinite(p.sigma) and p.sigma > 0):
+    return sigma_decimals(p.sigma)
+
+
+def sigma_decimals(sigma: float) -> int:
+    """Decimals that show two digits of a sigma; 4 where it is not known or 0."""
+    if not (np.isfinite(sigma) and sigma > 0):
         return 4
-    return int(np.clip(1 - np.floor(np.log10(p.sigma)), 0, 9))
+    return int(np.clip(1 - np.floor(np.log10(sigma)), 0, 9))
 
 
 def plain_number(value: float, decimals: int) -> str:

@@ -28,12 +28,11 @@ from lasercal_gtsam.report.html.matrices import correlation_matrix
 from lasercal_gtsam.report.html.numbers import (
     axis_ticks,
     chance,
-    decimals_for,
     fixed,
     significant,
     tick_text,
 )
-from lasercal_gtsam.report.html.page import SECTIONS, _asset, _pad
+from lasercal_gtsam.report.html.page import SECTIONS, _asset, _by_sigma, _pad
 from lasercal_gtsam.report.html.palettes import CATEGORIES, sequential
 from lasercal_gtsam.report.html.pictures import residual_histogram, residual_vectors
 from lasercal_gtsam.report.html.planes import _rectangles, error_map, plane_coverage
@@ -164,11 +163,13 @@ def test_nothing_is_loaded_and_no_other_script_can_run(named: Any) -> None:
     style = page.texts["style"][0]
     assert "url(" not in style
     assert "@import" not in style
-    # the only address in the file is the name of SVG, which nobody fetches
-    assert set(re.findall(r"https?://[^\s\"'<&]+", text.split("report-data")[0])) <= {
-        "http://www.w3.org/2000/svg",
-        "http://example.invalid/x",
-    }
+    # the only address in the file is the name of SVG, which nobody fetches, and what users wrote
+    found = set(re.findall(r"https?://[^\s\"'<&]+", text.split("report-data")[0]))
+    assert all(
+        address == "http://www.w3.org/2000/svg"
+        or "http://example.invalid/x".startswith(address.rstrip("…"))
+        for address in found
+    )
 
 
 def test_the_data_in_the_page_are_the_document(named: Any) -> None:
@@ -394,7 +395,8 @@ def test_ticks_are_round_and_inside(low: float, size: float, count: int) -> None
 
 
 def test_numbers_are_printed_by_their_sigma() -> None:
-    assert [decimals_for(s) for s in (0.0123, 0.7, 3.4, 120.0, 0.0, np.nan)] == [3, 2, 1, 0, 4, 4]
+    assert [_by_sigma(1.0, s) for s in (0.0123, 3.4, None)] == ["1.000", "1.0", "1.0000"]
+    assert fixed(0.5, 1, sign=True) == "+0.5"
     assert fixed(-0.0001, 2) == "0.00"
     assert fixed(-1.5, 1) == "\N{MINUS SIGN}1.5"
     assert fixed(None, 2) == fixed(np.nan, 2) == significant(None) == ""

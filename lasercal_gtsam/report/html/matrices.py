@@ -13,7 +13,7 @@ from lasercal_gtsam.report.html.numbers import fixed
 from lasercal_gtsam.report.html.svg import drawing, element, group, label, number, tooltip
 
 _CELL = 21.0
-_LETTER = 6.4
+_LETTER, _LONGEST = 6.4, 28
 # below this a cell is left empty; from the other on the number is in it
 _FAINT, _NUMBERED = 0.05, 0.5
 # from here on white is easier to read on the cell than black; in dark mode the other way round
@@ -26,13 +26,14 @@ _BAR_WIDTH, _BAR_HEIGHT = 112.0, 10.0
 def correlation_matrix(correlation: Mapping[str, Any]) -> Markup:
     """The lower half of the matrix: hue for the sign, strength and numbers for the size."""
     names = correlation["names"]
+    shown = [name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…" for name in names]
     matrix = np.array(correlation["matrix"], dtype=float)
     n = len(names)
-    left = 14 + _LETTER * max((len(name) for name in names), default=1)
+    left = 14 + _LETTER * max((len(name) for name in shown), default=1)
     # the name of a column stands on the diagonal: the later ones need no room above
-    top = max((10 + _LETTER * len(name) - i * _CELL for i, name in enumerate(names)), default=0.0)
+    top = max((10 + _LETTER * len(name) - i * _CELL for i, name in enumerate(shown)), default=0.0)
     parts: list[Markup] = []
-    for i, name in enumerate(names):
+    for i, name in enumerate(shown):
         x, y = left + (i + 0.5) * _CELL + 4, top + i * _CELL
         parts.append(label(left - 6, y + _CELL / 2 + 4, name, "end"))
         parts.append(
@@ -66,7 +67,7 @@ def correlation_matrix(correlation: Mapping[str, Any]) -> Markup:
 
 
 def level_bar(cell: Mapping[str, Any], longest: float) -> Markup:
-    """A bar for the residual with a mark where it is expected; what is above is hatched darker.
+    """A bar for the residual with a mark where it is expected; what is above it has another colour.
 
     Hidden from screen readers: the numbers stand beside it.
     """

@@ -5,16 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from lasercal_gtsam.calibration import plain_number
+
 MINUS = "\N{MINUS SIGN}"
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _ROUND = (1.0, 2.0, 2.5, 5.0, 10.0)
-
-
-def decimals_for(sigma: float, digits: int = 2) -> int:
-    """Decimals that show so many digits of a sigma; 4 where there is none to go by."""
-    if not (math.isfinite(sigma) and sigma > 0):
-        return 4
-    return min(max(digits - 1 - math.floor(math.log10(sigma)), 0), 9)
 
 
 def true_minus(text: str) -> str:
@@ -24,10 +19,8 @@ def true_minus(text: str) -> str:
 
 def fixed(value: float | None, decimals: int, *, sign: bool = False) -> str:
     """A number with so many decimals, never minus zero; empty where there is none."""
-    if value is None or not math.isfinite(value):
-        return ""
-    rounded = round(value, decimals) + 0.0
-    return f"{rounded:{'+' if sign else ''}.{decimals}f}".replace("-", MINUS)
+    text = "" if value is None else plain_number(value, decimals)
+    return f"+{text}" if sign and text and not text.startswith("-") else true_minus(text)
 
 
 def significant(value: float | None, digits: int = 3) -> str:

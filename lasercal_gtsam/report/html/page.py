@@ -14,6 +14,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from lasercal_gtsam.calibration import sigma_decimals
 from lasercal_gtsam.report.html import matrices, numbers, palettes, pictures, planes, scene
 
 SECTIONS = (
@@ -21,9 +22,9 @@ SECTIONS = (
     "correlation", "weak", "scene", "model_error", "conventions", "inputs",
 )  # fmt: skip
 """Sections in the order of the page: a key of the document, a template and an anchor each."""
-_TIGHT = "\N{NO-BREAK SPACE}"
 FEW = 12
 """Rows of a table beyond which the rest is folded away."""
+_TIGHT = "\N{NO-BREAK SPACE}"
 
 
 def render(document: Mapping[str, Any]) -> str:
@@ -149,7 +150,7 @@ def _pair(values: Sequence[float] | None, decimals: int) -> str:
 
 
 def _by_sigma(value: float | None, sigma: float | None) -> str:
-    return numbers.fixed(value, numbers.decimals_for(sigma if sigma is not None else 0.0))
+    return numbers.fixed(value, sigma_decimals(sigma if sigma is not None else 0.0))
 
 
 def _measure(value: float | None, unit: str, digits: int = 2) -> str:

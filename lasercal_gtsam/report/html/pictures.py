@@ -13,6 +13,7 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.report.html.numbers import fixed, significant
 from lasercal_gtsam.report.html.palettes import category
 from lasercal_gtsam.report.html.svg import (
+    FOOT,
     Frame,
     drawing,
     element,
@@ -25,9 +26,11 @@ from lasercal_gtsam.report.html.svg import (
 )
 
 WIDTH = 520.0
-_TALLEST = 430.0
+_TALLEST, _HISTOGRAM_HEIGHT = 430.0, 340.0
 # beyond so many arrows or dots none can be pointed at: they share one path, without names
 _MOST_NAMED = 500
+# of more fields than this the counts are not written into them
+_MOST_COUNTED = 48
 # fields with less than this share of the usual number of spots: their mean is mostly noise
 _FEW_SHARE = 0.2
 _HEAD, _HEAD_SHARE, _HEAD_ANGLE = 6.0, 0.4, math.radians(24)
@@ -40,12 +43,10 @@ def residual_vectors(image: Mapping[str, Any]) -> Markup:
     spots, planes = image["spots"], image["planes"]
     scale = image["magnification"] * frame.scale
     parts = [frame.axes("u (px)", "v (px)")]
-    many = len(spots["u"]) > _MOST_NAMED
-    inside: list[Markup] = []
     rejected = image["rejected"]
     tails, steps = _columns(frame, rejected, scale)
-    names = _arrow_names(rejected, "rejected")
-    inside += [
+    names = _arrow_names(rejected, ["rejected"] * len(tails))
+    inside = [
         group(
             [
                 element("path", d=_shaft(tail, step), class_="arrow rejected faint"),
@@ -56,16 +57,18 @@ def residual_vectors(image: Mapping[str, Any]) -> Markup:
     ]
     tails, steps = _columns(frame, spots, scale)
     belongs = np.asarray(spots["plane"], dtype=int)
-    for k, plane in enumerate(planes):
-        rows = np.flatnonzero(belongs == k)
-        class_ = f"arrow {category(k)}" + (" faint" if image["bins"] else "")
-        if many:
-            inside.append(element("path", d=arrows(tails[rows], steps[rows]), class_=class_))
-            continue
-        named = _arrow_names(spots, f"plane {plane}")
+    classes = [f"arrow {category(k)}{' faint' if image['bins'] else ''}" for k in belongs]
+    if len(tails) > _MOST_NAMED:
         inside += [
-            element("path", tooltip(named[i]), d=arrow(tails[i], steps[i]), class_=class_)
-            for i in rows
+            element("path", d=arrows(tails[rows], steps[rows]), class_=classes[rows[0]])
+            for rows in (np.flatnonzero(belongs == k) for k in range(len(planes)))
+            if len(rows)
+        ]
+    else:
+        names = _arrow_names(spots, [f"plane {planes[k]}" for k in belongs])
+        inside += [
+            element("path", tooltip(name), d=arrow(tail, step), class_=class_)
+            for name, tail, step, class_ in zip(names, tails, steps, classes, strict=True)
         ]
     if image["bins"]:
         tails, steps = _columns(frame, image["bins"], image["bins_magnification"] * frame.scale)
@@ -86,7 +89,7 @@ def residual_vectors(image: Mapping[str, Any]) -> Markup:
     parts += _scale_arrows(frame, image, scale)
     return drawing(
         WIDTH,
-        frame.bottom + 44,
+        frame.bottom + FOOT,
         parts,
         title=f"Residual vectors, camera {image['camera']}",
         description=image["alt"],
@@ -101,8 +104,8 @@ def residual_histogram(histogram: Mapping[str, Any]) -> Markup:
         counts.max(initial=1.0), max(expected or [0.0]), max(curve["count"] if curve else [0])
     )
     frame = Frame.filling(
-        (WIDTH, 340.0), (float(edges[0]), float(edges[-1])), (0.0, 1.06 * float(top)),
-        margins=(14.0, 14.0, 44.0, 58.0 if top < 1e4 else 78.0),
+        (WIDTH, _HISTOGRAM_HEIGHT), (float(edges[0]), float(edges[-1])), (0.0, 1.06 * float(top)),
+        margins=(14.0, 14.0, 58.0 if top < 1e4 else 78.0),
     )  # fmt: skip
     bars = []
     for k, (low, high, count) in enumerate(zip(edges[:-1], edges[1:], counts, strict=True)):
@@ -116,7 +119,7 @@ def residual_histogram(histogram: Mapping[str, Any]) -> Markup:
                 width=max(frame.at_x(high) - x - 1.0, 0.5), class_="bar",
             )
         )  # fmt: skip
-    parts = [frame.axes("residual, u and v (px)", "coordinates", grid=False), *bars]
+    parts = [frame.axes("residual, u and v (px)", "coordinates"), *bars]
     if curve:
         line = frame.at(np.column_stack([curve["x_px"], curve["count"]]))
         parts.append(window(frame, [element("path", d=path_through(line), class_="expected")]))
@@ -125,7 +128,7 @@ def residual_histogram(histogram: Mapping[str, Any]) -> Markup:
         parts.append(element("path", d=path_through(frame.at(steps)), class_="expected"))
     return drawing(
         WIDTH,
-        340.0,
+        _HISTOGRAM_HEIGHT,
         parts,
         title=f"Histogram of residuals, camera {histogram['camera']}",
         description=histogram["alt"],
@@ -150,7 +153,7 @@ def image_coverage(image: Mapping[str, Any]) -> Markup:
                 fill_opacity=None if empty else float(0.06 + 0.34 * counts[r, c] / most),
             )
         )  # fmt: skip
-        if rows * columns <= 48:
+        if rows * columns <= _MOST_COUNTED:
             fields.append(label(x + 5, y + 15, f"{counts[r, c]:.0f}", class_="count"))
     parts = [*fields, frame.axes("u (px)", "v (px)")]
     parts += dots(frame, image["spots"], image["planes"], ("u", "v"))
@@ -159,7 +162,7 @@ def image_coverage(image: Mapping[str, Any]) -> Markup:
         parts.append(element("path", d=hull, class_="hull"))
     return drawing(
         WIDTH,
-        frame.bottom + 44,
+        frame.bottom + FOOT,
         parts,
         title=f"Coverage of the picture, camera {image['camera']}",
         description=image["alt"],
@@ -172,7 +175,7 @@ def picture_frame(size: Sequence[int], top: float = 12.0) -> Frame:
         WIDTH,
         (-0.5, size[0] - 0.5),
         (size[1] - 0.5, -0.5),
-        margins=(top, 14.0, 44.0, 58.0),
+        margins=(top, 14.0, 58.0),
         tallest=_TALLEST,
     )
 
@@ -229,6 +232,8 @@ def arrows(tails: Array, steps: Array) -> str:
 def _scale_arrows(frame: Frame, image: Mapping[str, Any], scale: float) -> Iterator[Markup]:
     """What an arrow's length means, above the picture."""
     length = image["reference_px"] * scale
+    if not length > 0:
+        return
     x = frame.left
     words = f"{_px(image['reference_px'])} ({_times(image['magnification'])})"
     yield from _scale_arrow(x, 18.0, length, words, "arrow key")
@@ -249,10 +254,11 @@ def _columns(frame: Frame, columns: Mapping[str, Any], scale: float) -> tuple[Ar
     return tails, np.column_stack([columns["du"], columns["dv"]]).reshape(-1, 2) * scale
 
 
-def _arrow_names(columns: Mapping[str, Any], where: str) -> list[str]:
+def _arrow_names(columns: Mapping[str, Any], where: Sequence[str]) -> list[str]:
+    rows = zip(columns["id"], where, columns["du"], columns["dv"], strict=True)
     return [
-        f"{name}, {where}: {_vector(du, dv)} px, length {significant(math.hypot(du, dv), 2)} px"
-        for name, du, dv in zip(columns["id"], columns["du"], columns["dv"], strict=True)
+        f"{name}, {place}: {_vector(du, dv)} px, length {significant(math.hypot(du, dv), 2)} px"
+        for name, place, du, dv in rows
     ]
 
 

@@ -13,6 +13,7 @@ from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.report.html.palettes import sequential
 from lasercal_gtsam.report.html.pictures import WIDTH, crosses, dots
 from lasercal_gtsam.report.html.svg import (
+    FOOT,
     Frame,
     colour_bar,
     drawing,
@@ -27,7 +28,7 @@ from lasercal_gtsam.report.html.svg import (
 Mask = npt.NDArray[np.bool_]
 
 _TALLEST = 420.0
-_SHADES = 32
+_SHADES, _LEGEND = 32, 300.0
 _MARGIN = 0.04
 # a contour shorter than this many figure units has no room for its label
 _ROOM = 60.0
@@ -51,7 +52,7 @@ def plane_coverage(plane: Mapping[str, Any], index: int) -> Markup:
     inside.append(crosses(frame, np.column_stack([out["x_mm"], out["y_mm"]])))
     return drawing(
         WIDTH,
-        frame.bottom + 44,
+        frame.bottom + FOOT,
         [frame.axes("x on the plane (mm)", "y (mm)"), window(frame, inside)],
         title=f"Coverage of plane {plane['plane']}",
         description=plane["alt"],
@@ -89,7 +90,7 @@ def plane_frame(outlines: Sequence[Array], top: float = 12.0, margin: float = _M
         WIDTH,
         (middle[0] - half[0], middle[0] + half[0]),
         (middle[1] - half[1], middle[1] + half[1]),
-        margins=(top, 14.0, 44.0, 62.0),
+        margins=(top, 14.0, 62.0),
         tallest=_TALLEST,
     )
 
@@ -121,12 +122,12 @@ def _map(
             inside += [element("path", d=line, class_=f"outline {c}") for c in classes]
     inside.append(labels)
     legend = colour_bar(
-        frame.left, 2.0, min(300.0, frame.width), sequential(np.linspace(0, 1, _SHADES)),
+        frame.left, 2.0, min(_LEGEND, frame.width), sequential(np.linspace(0, 1, _SHADES)),
         (low, high), name, more=bool(np.nanmax(values, initial=low) > high),
     )  # fmt: skip
     return drawing(
         WIDTH,
-        frame.bottom + 44,
+        frame.bottom + FOOT,
         [legend, frame.axes("x on the plane (mm)", "y (mm)"), window(frame, inside)],
         title=title,
         description=description,
@@ -193,7 +194,7 @@ def _contours(
             place = _quiet_place(frame, longest, placed)
             placed.append(place)
             x, y = float(place[0]), float(place[1])
-            labels.append(label(x, y + 4, contour["text"], "middle", f"{class_} text"))
+            labels.append(label(x, y + 4, contour["text"], "middle", class_))
     return group(lines), group(labels)
 
 

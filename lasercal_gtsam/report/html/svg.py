@@ -7,7 +7,6 @@ CSS pixel where the figure is shown at its natural width.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -17,8 +16,10 @@ from markupsafe import Markup, escape
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.report.html.numbers import axis_ticks, significant, tick_text
 
-_MARGINS = (12.0, 14.0, 40.0, 54.0)
+FOOT = 44.0
+"""Height below a frame that its axis takes."""
 _TICK = 5.0
+_TICKS = (6, 5)
 
 
 def element(tag: str, *children: object, **attributes: object) -> Markup:
@@ -72,8 +73,6 @@ def drawing(
     """
     return element(
         "svg",
-        element("title", title),
-        element("desc", description),
         *children,
         xmlns="http://www.w3.org/2000/svg",
         viewBox=f"0 0 {number(width)} {number(height)}",
@@ -110,11 +109,11 @@ class Frame:
         size: tuple[float, float],
         x: tuple[float, float],
         y: tuple[float, float],
-        margins: tuple[float, float, float, float] = _MARGINS,
+        margins: tuple[float, float, float],
     ) -> Frame:
-        """The frame that fills a figure of that size but for margins (top, right, bottom, left)."""
-        top, right, bottom, left = margins
-        return cls(left, top, size[0] - left - right, size[1] - top - bottom, x, y)
+        """The frame that fills a figure of that size but for margins (top, right, left)."""
+        top, right, left = margins
+        return cls(left, top, size[0] - left - right, size[1] - top - FOOT, x, y)
 
     @classmethod
     def isometric(
@@ -122,11 +121,11 @@ class Frame:
         width: float,
         x: tuple[float, float],
         y: tuple[float, float],
-        margins: tuple[float, float, float, float] = _MARGINS,
-        tallest: float = math.inf,
+        margins: tuple[float, float, float],
+        tallest: float,
     ) -> Frame:
-        """The frame of a figure of that width with equal scales; no taller than ``tallest``."""
-        top, right, _, left = margins
+        """The frame of a figure of that width with equal scales; margins are top, right, left."""
+        top, right, left = margins
         inner = width - left - right
         wide, high = abs(x[1] - x[0]), abs(y[1] - y[0])
         height = inner * high / wide
@@ -164,36 +163,22 @@ class Frame:
         share = (points - [x0, y0]) / [(x1 - x0) or 1.0, (y1 - y0) or 1.0]
         return np.asarray([self.left, self.bottom] + share * [self.width, -self.height])
 
-    def axes(
-        self,
-        x_label: str,
-        y_label: str,
-        *,
-        ticks: tuple[int, int] = (6, 5),
-        grid: bool = False,
-        outline: bool = True,
-    ) -> Markup:
-        """Ticks, numbers and names of both axes."""
-        parts: list[Markup] = []
-        if outline:
-            parts.append(
-                element(
-                    "rect", x=self.left, y=self.top, width=self.width, height=self.height,
-                    class_="frame",
-                )
-            )  # fmt: skip
-        for value, text in _labelled(self.x, ticks[0]):
+    def axes(self, x_label: str, y_label: str) -> Markup:
+        """Outline, ticks, numbers and names of both axes."""
+        parts = [
+            element(
+                "rect", x=self.left, y=self.top, width=self.width, height=self.height,
+                class_="frame",
+            )
+        ]  # fmt: skip
+        for value, text in _labelled(self.x, _TICKS[0]):
             x = self.at_x(value)
             parts.append(_line(x, self.bottom, x, self.bottom + _TICK, "tick"))
             parts.append(label(x, self.bottom + 17, text, "middle"))
-            if grid:
-                parts.append(_line(x, self.top, x, self.bottom, "grid"))
-        for value, text in _labelled(self.y, ticks[1]):
+        for value, text in _labelled(self.y, _TICKS[1]):
             y = self.at_y(value)
             parts.append(_line(self.left - _TICK, y, self.left, y, "tick"))
             parts.append(label(self.left - 8, y + 4, text, "end"))
-            if grid:
-                parts.append(_line(self.left, y, self.right, y, "grid"))
         parts.append(label(self.left + self.width / 2, self.bottom + 34, x_label, "middle", "name"))
         middle = self.top + self.height / 2
         parts.append(
@@ -255,7 +240,7 @@ def colour_bar(
     if more:
         parts.append(label(x + width + 8, y + 25, f"{significant(span[1], 2)} and more"))
     for value, text in _labelled(span, 5):
-        at = x + (value - span[0]) / (span[1] - span[0]) * width
+        at = x + (value - span[0]) / ((span[1] - span[0]) or 1.0) * width
         parts.append(_line(at, y + 26, at, y + 30, "tick"))
         parts.append(label(at, y + 42, text, "middle"))
     return group(parts, class_="axes")
