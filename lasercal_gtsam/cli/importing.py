@@ -18,7 +18,7 @@ from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
-    from lasercal_gtsam.recordings.bags import Bag, BagPictures
+    from lasercal_gtsam.recordings.bags import Bag
     from lasercal_gtsam.recordings.laser import LaserAt
     from lasercal_gtsam.recordings.motion import Motion
     from lasercal_gtsam.recordings.plan import Plan
@@ -230,7 +230,7 @@ def _from_folder(ask: ImportRequest, poses: Path) -> _Recorded:
 
 
 def _from_bag(ask: ImportRequest, bag: Bag) -> _Recorded:
-    from lasercal_gtsam.recordings.bags import clock_notes
+    from lasercal_gtsam.recordings.bag_notes import clock_notes
 
     if ask.pose_topic is not None:
         motion = bag.pose_motion(ask.pose_topic, ask.base, ask.hand)
@@ -256,17 +256,11 @@ def _from_bag(ask: ImportRequest, bag: Bag) -> _Recorded:
         _planes(ask, bag, motion, sources),
         _laser(ask, bag),
         about,
-        (*clock_notes(bag.lags, list(topics.values())), *_lossy_notes(sources)),
+        (
+            *clock_notes(bag.lags, list(topics.values())),
+            *(note for source in sources for note in source.notes),
+        ),
     )
-
-
-def _lossy_notes(sources: Sequence[BagPictures]) -> list[str]:
-    return [
-        f"{source.name} was compressed as JPEG, which moves spots by some tenths of a pixel; "
-        "record the raw topic if you can"
-        for source in sources
-        if source.lossy
-    ]
 
 
 def _image_topics(ask: ImportRequest, bag: Bag) -> dict[str, str]:

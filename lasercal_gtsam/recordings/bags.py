@@ -13,6 +13,7 @@ import numpy as np
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.pictures import Picture
 from lasercal_gtsam.io.wording import did_you_mean, some
+from lasercal_gtsam.recordings.bag_notes import picture_notes
 from lasercal_gtsam.recordings.messages import (
     CameraInfo,
     camera_info_of,
@@ -24,7 +25,6 @@ from lasercal_gtsam.recordings.stamps import (
     NS_PER_S,
     Stamps,
     as_stamps,
-    duration_text,
     seconds_text,
 )
 from lasercal_gtsam.recordings.tree import TransformTree
@@ -248,10 +248,13 @@ class Bag:
         offset : added to the stamps, nanoseconds
         """
         self.check_topic(topic, IMAGE_TYPES, "image topic")
-        pairs, formats = [], set()
+        pairs, formats, sizes = [], set(), set()
         for received, message in self._messages([topic]):
             pairs.append((self._stamp(message.header, received), received))
-            formats.add(str(getattr(message, "format", "")).lower())
+            if hasattr(message, "format"):
+                formats.add(str(message.format).lower())
+            else:
+                sizes.add((int(message.width), int(message.height)))
         if self._clock == "header" and any(stamp == 0 for stamp, _ in pairs):
             raise DataError(
                 f"{topic}: its messages have no stamp; use the time when they were received "
@@ -261,8 +264,10 @@ class Bag:
         first: dict[int, int] = {}
         for stamp, received in pairs:
             first.setdefault(stamp, received)
-        lossy = any("jpeg" in form or "jpg" in form for form in formats)
-        return BagPictures(self, topic, camera, sorted(first.items()), offset, lossy)
+        notes = picture_notes(
+            topic, formats, sizes, len(pairs) - len(first), self.camera_info(topic)
+        )
+        return BagPictures(self, topic, camera, sorted(first.items()), offset, notes)
 
     def latched(self, topic: str, kind: str) -> tuple[Stamps, list[Any]]:
         """Values of a ``std_msgs`` topic and when they were received, in that order."""
@@ -333,7 +338,7 @@ class Bag:
 class BagPictures:
     """Pictures of an image topic as a `PictureSource`; made by `Bag.pictures`.
 
-    ``lossy``: they were compressed as JPEG, which moves the centre of a spot.
+    ``notes`` say what was found odd in the topic.
     """
 
     def __init__(
@@ -343,11 +348,11 @@ class BagPictures:
         camera: str,
         times: Sequence[tuple[int, int]],
         offset: int,
-        lossy: bool,
+        notes: tuple[str, ...],
     ) -> None:
         self.camera = camera
         self.name = topic
-        self.lossy = lossy
+        self.notes = notes
         self._bag = bag
         self._times = list(times)
         self.stamps = as_stamps([stamp + offset for stamp, _ in times])
@@ -355,27 +360,6 @@ class BagPictures:
     def read(self, which: Sequence[int]) -> Iterator[tuple[int, Picture]]:
         """Read some pictures; see `PictureSource`."""
         yield from self._bag.read_pictures(self.name, {self._times[k]: k for k in which})
-
-
-def clock_notes(lags: Mapping[str, float], images: Sequence[str]) -> list[str]:
-    """Say where pictures and poses reach the recorder with very different delays.
-
-    Parameters
-    ----------
-    lags : as `Bag.lags`
-    images : the image topics among them
-    """
-    others = {
-        topic: lag for topic, lag in lags.items() if topic not in images and "static" not in topic
-    }
-    return [
-        f"{image} is received {duration_text(lags[image])} after its stamps, {topic} "
-        f"{duration_text(lag)}: their clocks may differ by that much (--image-offset, or --stamps "
-        "received)"
-        for image in images
-        for topic, lag in others.items()
-        if image in lags and abs(lags[image] - lag) > NS_PER_S // 2
-    ]
 
 
 def _damaged(name: str, files: Sequence[Path], error: Exception) -> DataError:

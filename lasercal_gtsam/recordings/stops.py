@@ -16,6 +16,7 @@ from lasercal_gtsam.units import DEG_PER_RAD, M_PER_MM, MM_PER_M, RAD_PER_DEG
 
 _SAMPLES = 30  # in a window
 _LONGEST_PERIOD = NS_PER_S // 100
+_CHUNK = 50_000
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,8 @@ def find_stops(motion: Motion, limits: StillLimits) -> tuple[Stop, ...]:
         stamps = np.arange(first, last + 1, period, dtype=np.int64)
         if len(stamps) < 2 * half + 1:
             continue
-        T, _ = motion.at(stamps, limits.max_gap_ns)
         inner = slice(half, len(stamps) - half)  # whose windows lie within the run
-        moved = _diagonal(T[:, :3, 3], half)[inner]
-        turned = _diagonal(T[:, :3, :3].reshape(-1, 9), half)[inner] / np.sqrt(2)
+        moved, turned = _extents(motion, stamps, half, limits.max_gap_ns)[:, inner]
         still = (moved <= limits.move_m) & (turned <= limits.turn_rad)
         edges = np.flatnonzero(np.diff(np.r_[False, still, False].astype(np.int8)))
         times = stamps[inner]
@@ -151,6 +150,25 @@ def _check_often(motion: Motion, limits: StillLimits) -> None:
         "the hand does not move unseen in between, or give --every-picture if there is a pose for "
         "each picture, taken at a standstill"
     )
+
+
+def _extents(motion: Motion, stamps: Stamps, half: int, max_gap: int) -> Array:
+    """How far the hand moves (m) and turns (rad) within ``half`` samples of each stamp; (2, M).
+
+    Hours of recording are sampled some minutes at a time.
+    """
+    pieces = []
+    for start in range(0, len(stamps), _CHUNK):
+        before = max(start - half, 0)
+        T, _ = motion.at(stamps[before : start + _CHUNK + half], max_gap)
+        both = np.stack(
+            [
+                _diagonal(T[:, :3, 3], half),
+                _diagonal(T[:, :3, :3].reshape(-1, 9), half) / np.sqrt(2),
+            ]
+        )
+        pieces.append(both[:, start - before : start - before + _CHUNK])
+    return np.concatenate(pieces, axis=1)
 
 
 def _diagonal(values: Array, half: int) -> Array:

@@ -153,6 +153,28 @@ def test_jpeg_is_taken_with_a_warning(few, lasercal, tmp_path):
     assert "/camera/image_raw was compressed as JPEG" in outcome.err
 
 
+def test_odd_image_topics_are_noted(few, lasercal, tmp_path):
+    events = list(Session().events(few))
+    images = [event for event in events if event[1] == IMAGES]
+    halved = [
+        (at, topic, kind, (stamp, np.ascontiguousarray(array[::2, ::2]), session))
+        for at, topic, kind, (stamp, array, session) in images
+    ]
+    others = [event for event in events if event[1] != IMAGES]
+    again = [(at + 1, *rest) for at, *rest in halved[:3]]
+    bag = write_bag(tmp_path / "bag", "mcap", [*others, *halved, *again])
+    outcome = lasercal("import", bag, "--dry-run", *FRAMES, "--plane", "1", "--laser-on")
+    assert outcome.status == 0, outcome.err
+    assert f"{IMAGES}: 3 pictures have the stamp of another one" in outcome.err
+    assert "speaks of 160 x 120 pixels, the pictures of" in outcome.err
+    assert "have 80 x 60: are they binned or cut?" in outcome.err
+    changing = write_bag(tmp_path / "changing", "mcap", [*others, *images[:20], *halved[20:]])
+    refused = lasercal("import", changing, "-o", tmp_path / "o", *FRAMES, "--plane", "1")
+    assert refused.status == 1
+    assert "is 80 x 60 pixels, those before have 160 x 120" in refused.err
+    assert not any((tmp_path / "o").iterdir())
+
+
 def test_two_cameras(few, lasercal, tmp_path):
     events = list(Session().events(few))
     events += [

@@ -122,6 +122,16 @@ def test_stops_end_half_a_window_before_motion():
     np.testing.assert_allclose(times, [(0.15, 0.85), (2.15, 2.84)], atol=0.011)
 
 
+def test_hours_are_sampled_piece_by_piece(monkeypatch):
+    rng = np.random.default_rng(8)
+    steps = np.repeat(rng.uniform(-0.1, 0.1, 40), 60)
+    motion = moving_along_x(steps + 2e-5 * rng.uniform(-1, 1, len(steps)))
+    whole = find_stops(motion, StillLimits())
+    assert len(whole) == 40
+    monkeypatch.setattr("lasercal_gtsam.recordings.stops._CHUNK", 37)
+    assert find_stops(motion, StillLimits()) == whole
+
+
 def test_turning_is_motion_too():
     angle = np.where(np.arange(200) < 100, 0.0, 1e-4 * (np.arange(200) - 100))  # 0.01 rad/s
     T = np.tile(np.eye(4), (200, 1, 1))
