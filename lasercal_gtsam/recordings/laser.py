@@ -37,7 +37,8 @@ class LaserStates:
     Attributes
     ----------
     state : (N,) `ON`, `OFF` or `UNKNOWN`
-    uniform : all pictures show the same; whether the laser is on or off cannot be told
+    uniform : the pictures show the same; whether the laser is on or off cannot be told, and `ON`
+        stands for those that are alike
     """
 
     state: States
@@ -62,23 +63,27 @@ def states_of(pictures: Sequence[Picture]) -> LaserStates:
     """Tell laser-on from laser-off pictures of one stop.
 
     The camera and the hand stand still, so a compact light that one picture has and another has
-    not is the spot. Each picture is compared with the first; where the clearest difference is, the
-    light is measured in all of them. Pictures exposed while the laser was switched (25 % to 75 % of
-    the spot's light) and pictures that differ both ways (somebody walked through) are `UNKNOWN`.
+    not is the spot. Each picture is compared with the first (or the next, where most differ from it
+    by more than a spot); where the clearest difference is, the light is measured in all of them.
+    Pictures exposed while the laser was switched (25 % to 75 % of the spot's light) and pictures
+    that differ both ways (somebody walked through) are `UNKNOWN`.
     """
     shown = [_coarse(picture) for picture in pictures]
-    changes = [_change(picture, shown[0]) for picture in shown]
-    clear = [change for change in changes if change is not None]
-    clearest = max(clear, key=lambda change: abs(change.height))
     state = np.zeros(len(pictures), dtype=np.int8)
+    for reference in shown:
+        changes = [_change(picture, reference) for picture in shown]
+        clear = [change for change in changes if change is not None]
+        if 2 * len(clear) > len(shown):
+            break
+    else:
+        return LaserStates(state, uniform=False)
+    known = np.array([change is not None for change in changes])
+    clearest = max(clear, key=lambda change: abs(change.height))
     if clearest.height == 0:
+        state[known] = ON
         return LaserStates(state, uniform=True)
-    level = np.array(
-        [
-            np.nan if change is None else _light_at(picture, shown[0], clearest)
-            for picture, change in zip(shown, changes, strict=True)
-        ]
-    )
+    level = np.full(len(shown), np.nan)
+    level[known] = [_light_at(shown[k], reference, clearest) for k in np.flatnonzero(known)]
     share = (level - np.nanmin(level)) / (np.nanmax(level) - np.nanmin(level))
     state[share >= _LIT] = ON
     state[share <= _DARK] = OFF

@@ -290,9 +290,7 @@ class _Chooser:
         if len(sizes) > 1:
             return members, f"its pictures differ in size: {sorted(map(str, sizes))}", False
         seen = states_of([read[k] for k in members.tolist()])
-        if seen.uniform:  # on, until it is known better
-            return members, np.full(len(members), ON, dtype=np.int8), True
-        return members, seen.state, False
+        return members, seen.state, seen.uniform
 
     def _with_off(self, pending: _Pending) -> Shot | None:
         shot, where = pending.shot, pending.where

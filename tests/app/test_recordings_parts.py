@@ -309,6 +309,11 @@ def test_pictures_that_are_all_alike_and_pictures_with_a_passer_by():
     walker[20:80, 80:100] -= 35
     seen = states_of([scene(0, seed=0), scene(80, seed=1), walker])
     assert seen.state.tolist() == [OFF, ON, UNKNOWN]
+    first = states_of([walker, scene(0, seed=0), scene(80, seed=1), scene(80, seed=2)])
+    assert first.state.tolist() == [UNKNOWN, OFF, ON, ON]
+    alike = states_of([walker, scene(80, seed=0), scene(80, seed=1), scene(80, seed=2)])
+    assert alike.uniform
+    assert alike.state.tolist() == [UNKNOWN, ON, ON, ON]
     assert spot_appears(scene(80, seed=1), scene(0, seed=2)) is True
     assert spot_appears(scene(0, seed=1), scene(80, seed=2)) is False
     assert spot_appears(scene(0, seed=1), scene(0, seed=2)) is False
