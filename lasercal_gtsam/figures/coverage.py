@@ -164,8 +164,8 @@ def plane_coverages(calibration: Calibration) -> tuple[PlaneCoverage, ...]:
 
 def _view(camera: str, outline: Array, border: Array) -> PlaneView:
     whole = area(outline)
-    share = area(clipped(outline, border)) / whole if whole > 0 and len(border) else None
-    return PlaneView(camera, outline, share if share is not None or whole <= 0 else 0.0)
+    covered = area(clipped(outline, border)) if len(border) else 0.0
+    return PlaneView(camera, outline, covered / whole if whole > 0 else None)
 
 
 def _rejected(

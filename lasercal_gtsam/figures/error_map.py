@@ -14,6 +14,7 @@ import numpy as np
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.figures.contours import contour_lines, even_levels, row_of_levels
+from lasercal_gtsam.figures.parts import calibrated_cell
 from lasercal_gtsam.figures.places import (
     Mask,
     PlaneAxes,
@@ -23,8 +24,11 @@ from lasercal_gtsam.figures.places import (
 )
 from lasercal_gtsam.figures.spots import places_of_spots, sampled, used_spots
 from lasercal_gtsam.frozen import Array, FrozenData
+from lasercal_gtsam.prediction import only
 from lasercal_gtsam.projection import point_jacobian, project_points, spot_on_ray
 from lasercal_gtsam.units import MM_PER_M
+
+Halves = tuple[Calibration, Calibration]
 
 NODES = 41
 """Grid nodes along the longer side of a map."""
@@ -106,12 +110,10 @@ class ErrorMap(FrozenData):
     split: SplitMap | None
 
 
-def error_maps(
-    calibration: Calibration, halves: tuple[Calibration, Calibration] | None = None
-) -> tuple[ErrorMap, ...]:
+def error_maps(calibration: Calibration, halves: Halves | None = None) -> tuple[ErrorMap, ...]:
     """A map for each plane and each camera that has spots there, or at least sees it.
 
-    Parts without a covariance, and planes that no camera sees, have none.
+    There are none without sigmas. Parts that nothing was observed of have none.
 
     Parameters
     ----------
@@ -119,27 +121,54 @@ def error_maps(
     halves : two halves of it (`opinions.split.fit_halves`), for the map from split data
     """
     seen, used = calibration.inputs.observations, used_spots(calibration)
+    known = calibrated_cell(calibration)
     found = []
-    for plane in calibration.cell.planes:
+    for plane in known.planes:
         cameras = [
             camera
-            for camera in calibration.cell.cameras
+            for camera in known.cameras
             if (used & (seen.plane == plane) & (seen.camera == camera)).any()
         ]
-        for camera in cameras or calibration.cell.cameras:
-            one = error_map(calibration, plane, camera, halves)
-            if one is not None:
-                found.append(one)
-    return tuple(found)
+        found += [_map(calibration, plane, camera, halves) for camera in cameras or known.cameras]
+    return tuple(one for one in found if one is not None)
 
 
 def error_map(
     calibration: Calibration,
-    plane: str,
-    camera: str,
-    halves: tuple[Calibration, Calibration] | None = None,
+    plane: str | None = None,
+    camera: str | None = None,
+    halves: Halves | None = None,
+) -> ErrorMap:
+    """The map of one plane as one camera sees it; see `error_maps`.
+
+    Parameters
+    ----------
+    plane, camera : names; may be left out where the cell has only one
+
+    Raises
+    ------
+    DataError
+        A name is unknown, left out where there are several, or was not calibrated; there are no
+        sigmas; or the camera does not see the plane.
+    """
+    known = calibrated_cell(calibration)
+    plane = only(tuple(known.planes), plane, "plane")
+    camera = only(tuple(known.cameras), camera, "camera")
+    found = _map(calibration, plane, camera, halves)
+    if found is None:
+        why = (
+            f"camera {camera!r} does not see plane {plane!r}"
+            if np.isfinite(calibration.fit.sigma0)
+            else "the calibration has no degrees of freedom left, and so no sigmas; add spots"
+        )
+        raise DataError(f"error map: {why}")
+    return found
+
+
+def _map(
+    calibration: Calibration, plane: str, camera: str, halves: Halves | None
 ) -> ErrorMap | None:
-    """The map of one plane as one camera sees it; see `error_maps`. None where there is none."""
+    """The map; None without sigmas, or where the camera does not see the plane."""
     cell, seen = calibration.cell, calibration.inputs.observations
     part = cell.cameras[camera]
     axes = PlaneAxes.of(cell.planes[plane], part)
@@ -156,10 +185,7 @@ def error_map(
     with np.errstate(invalid="ignore"):
         in_view = ((uv >= -0.5) & (uv <= np.array(part.image_size) - 0.5)).all(axis=1)
     near = in_view & (inside(nodes, border) if len(border) else True)
-    try:
-        _, cov = calibration.locate(uv, plane=plane, camera=camera)
-    except DataError:
-        return None
+    _, cov = calibration.locate(uv, plane=plane, camera=camera)
     shape = (len(y), len(x))
     error = MM_PER_M * np.sqrt(np.trace(cov, axis1=1, axis2=2))
     error[~_with_neighbours(in_view.reshape(shape)).ravel()] = np.nan
@@ -249,7 +275,7 @@ def _mm_per_px(points: Array, axes: PlaneAxes, calibration: Calibration, camera:
 
 def _split_map(
     whole: Calibration,
-    halves: tuple[Calibration, Calibration],
+    halves: Halves,
     plane: str,
     camera: str,
     uv: Array,
@@ -258,12 +284,8 @@ def _split_map(
     levels: Array,
 ) -> SplitMap:
     x, y = grid
-    first, second = (
-        spot_on_ray(part.cell, np.nan_to_num(uv, nan=-1e9), plane=plane, camera=camera)
-        for part in halves
-    )
+    first, second = (spot_on_ray(part.cell, uv, plane=plane, camera=camera) for part in halves)
     error = 0.5 * MM_PER_M * np.linalg.norm(first - second, axis=1)
-    error[~np.isfinite(uv).all(axis=1)] = np.nan
     variance = np.zeros(int(near.sum()))
     for part in halves:  # both with the noise of the whole
         noise = whole.fit.sigma0 / part.fit.sigma0

@@ -188,7 +188,10 @@ def residual_histograms(
     used = ~rejected_spots(calibration)
     sigma = np.full((len(seen), 2), np.nan)
     if bench is not None:
-        sigma[calibration.spots.weight > 0] = residual_sigmas(bench)
+        counted = calibration.spots.weight > 0
+        # a loss that trusts a spot less does not make its noise larger
+        trust = np.sqrt(calibration.spots.weight[counted])
+        sigma[counted] = trust[:, None] * residual_sigmas(bench)
     found = []
     for camera in seen.cameras:
         rows = used & (seen.camera == camera) & np.isfinite(residual).all(axis=1)
@@ -226,7 +229,8 @@ def residual_sigmas(bench: Bench) -> Array:
     """(N, 2) sigma of each coordinate of a residual: noise, less what the fit takes of it, px.
 
     With ``W`` the whitening of a spot and ``H`` the projector of the fit, the covariance of its
-    residual is ``W^-1 (I - H) W^-T``.
+    residual is ``W^-1 (I - H) W^-T``. (Of spots that share an error of the hand it is nearly so:
+    ``H`` is then that of the rows which make them independent.)
     """
     own = bench.Q[: 2 * len(bench)].reshape(len(bench), 2, -1)
     left = np.eye(2) - own @ np.swapaxes(own, 1, 2)

@@ -153,6 +153,12 @@ def judge(
         else:
             opinions = _opinions(calibration, bench, halves or parts is not None, parts)
             reasons += _of_opinions(opinions)  # a named cause before its effect
+            if opinions.spots < len(bench):
+                words = (
+                    f"the residuals were questioned on an even sample of {opinions.spots} of the "
+                    f"{len(bench)} spots"
+                )
+                reasons.append(Reason("sample", "note", words, "Nothing is to be done."))
             reasons += _of_noise(calibration, bench)
         reasons += _of_geometry(bench)
     reasons += _of_coverage(calibration)

@@ -93,12 +93,13 @@ def _commands(material: Material) -> Iterator[dict[str, str]]:
     if line:
         yield {"words": "Calibrate the capture again.", "command": line}
     if len(material.calibration.inputs.observations):
+        start = ", initial=old.initial" if options.fixed else ""  # held at the start's values
         yield {
             "words": "Calibrate again from the spots and options in the calibration itself, in "
             "Python.",
             "command": "import lasercal_gtsam as lc\n"
-            f"inputs = lc.load_calibration({file!r}).inputs\n"
-            "again = lc.calibrate(inputs.observations, options=inputs.options)",
+            f"old = lc.load_calibration({file!r})\n"
+            f"again = lc.calibrate(old.inputs.observations{start}, options=old.inputs.options)",
         }
     words = shlex.join(["lasercal", "report", file, "-o", _REPORT])
     yield {"words": "Make this report again.", "command": words}
@@ -130,4 +131,6 @@ def _calibrate(options: CalibrationOptions, capture: str, file: str) -> str | No
         words += ["--known", f"{name}={','.join(f'{x!r}' for x in numbers)}"]
     for name in options.fixed:
         words += ["--fixed", name]
+    if options.fixed:  # what is held there is what was held
+        words += ["--initial", file]
     return shlex.join([*words, "-o", file])

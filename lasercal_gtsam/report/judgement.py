@@ -9,7 +9,7 @@ import numpy as np
 from lasercal_gtsam.check.weakness import weaknesses
 from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.figures.error_map import ErrorMap
-from lasercal_gtsam.opinions.levels import Level, LevelPart
+from lasercal_gtsam.opinions.levels import Level
 from lasercal_gtsam.opinions.suspects import Finding
 from lasercal_gtsam.report.material import Material
 from lasercal_gtsam.report.plainly import number
@@ -176,26 +176,22 @@ def _nothing(material: Material) -> str:
 
 
 def _by_part(levels: tuple[Level, ...], kind: str) -> list[dict[str, Any]]:
-    """Rows of parts of one kind, with a cell for each level."""
-    rows: dict[str, list[tuple[str, LevelPart]]] = {}
-    for level in levels:
-        for part in level.parts:
-            if part.kind == kind:
-                rows.setdefault(part.name, []).append((level.name, part))
+    """Rows of parts of one kind, with a cell for each level; all levels have the same parts."""
+    columns = [[part for part in level.parts if part.kind == kind] for level in levels]
     return [
         {
-            "name": name,
-            "spots": cells[0][1].spots,
+            "name": parts[0].name,
+            "spots": parts[0].spots,
             "cells": [
                 {
-                    "level": level,
+                    "level": level.name,
                     "rms_px": number(part.rms_px, 4),
                     "expected_px": number(part.expected_px, 4),
                 }
-                for level, part in cells
+                for level, part in zip(levels, parts, strict=True)
             ],
         }
-        for name, cells in rows.items()
+        for parts in zip(*columns, strict=True)
     ]
 
 

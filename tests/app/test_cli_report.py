@@ -130,10 +130,10 @@ def test_intervals_by_the_likelihood_are_asked_for_every_row(lasercal, folder, m
 
     def ends(calibration, names):
         asked.extend(names)
-        return {name: (1.0, 2.0) for name in names}
+        return dict.fromkeys(names, (1.0, 2.0))
 
     assert lasercal("calibrate", folder).status == 0
-    monkeypatch.setattr("lasercal_gtsam.intervals.intervals", ends)
+    monkeypatch.setattr("lasercal_gtsam.confidence.intervals", ends)
     calibration = folder / "calibration.json"
     document, _ = document_of(lasercal, calibration, "--intervals", "likelihood")
     rows = document["parameters"]["rows"]

@@ -13,6 +13,7 @@ import lasercal_gtsam as lc
 from lasercal_gtsam.calibration import SpotResults
 from lasercal_gtsam.figures import (
     correlation,
+    error_map,
     error_maps,
     image_coverages,
     plane_coverages,
@@ -235,6 +236,16 @@ def test_maps_of_several_cameras_and_of_none_with_spots():
         assert one.outside_mm is None
     assert len(error_maps(one_plane())) == 1
     assert error_maps(no_freedom()) == ()
+
+
+def test_a_map_that_cannot_be_is_refused_in_words():
+    with pytest.raises(lc.DataError, match="plane: the cell has 1, 2, 3; none was named"):
+        error_map(usual())
+    with pytest.raises(lc.DataError, match="camera: .* 'eye' is not among them"):
+        error_map(usual(), "1", "eye")
+    with pytest.raises(lc.DataError, match="no degrees of freedom"):
+        error_map(no_freedom(), no_freedom().inputs.observations.planes[0])
+    assert error_map(usual(), "2") == error_maps(usual())[1]
 
 
 # --- correlation -------------------------------------------------------------------------------

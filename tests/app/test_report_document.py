@@ -255,6 +255,7 @@ def test_very_many_spots_make_no_larger_document():
     assert "1500 of 12000" in image["caption"]
     assert sum(image["bins"]["count"]) == 12_000
     assert any("sample of 2000 of" in words for words in document["levels"]["words"])
+    assert "sample" in {reason["code"] for reason in document["verdict"]["reasons"]}
 
 
 # --- weak, model error, inputs -----------------------------------------------------------------
