@@ -241,7 +241,7 @@ def test_maps_of_several_cameras_and_of_none_with_spots():
 def test_a_map_that_cannot_be_is_refused_in_words():
     with pytest.raises(lc.DataError, match="plane: the cell has 1, 2, 3; none was named"):
         error_map(usual())
-    with pytest.raises(lc.DataError, match="camera: .* 'eye' is not among them"):
+    with pytest.raises(lc.DataError, match=r"camera: .* 'eye' is not among them"):
         error_map(usual(), "1", "eye")
     with pytest.raises(lc.DataError, match="no degrees of freedom"):
         error_map(no_freedom(), no_freedom().inputs.observations.planes[0])

@@ -159,7 +159,14 @@ def report_lines(found: MapStudy) -> list[str]:
     lines = [f"{found.captures} captures, {len(found.skipped)} without an answer {found.skipped}"]
     for where, inside in (("among the spots", True), ("outside them", False)):
         for p in found.planes:
-            mine = p.inside == inside
+            # far out, where the map is an extrapolation, a lens may fold in some captures
+            located = np.isfinite(p.rms_mm)
+            mine = (p.inside == inside) & located
+            lost = int(((p.inside == inside) & ~located).sum())
+            if lost:
+                lines.append(
+                    f"plane {p.plane}, {lost} points {where}: not located in every capture"
+                )
             if not mine.any():
                 continue
             e, r = p.rms_mm[mine], p.ratio[mine]
