@@ -34,6 +34,7 @@ _EXPORTS = {
     "calibrate": "api",
     "export": "formats.export",
     "hand_pose_graph": "hand_noise.explicit",
+    "intervals": "confidence",
     "judge": "opinions",
     "check_sigma": "sigma_check.study",
     "load_calibration": "io.calibration_file",
@@ -74,6 +75,7 @@ __all__ = [
     "check_sigma",
     "export",
     "hand_pose_graph",
+    "intervals",
     "judge",
     "load_calibration",
     "load_capture",
@@ -91,6 +93,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.api import calibrate
     from lasercal_gtsam.calibration import Calibration, Parameter
     from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
+    from lasercal_gtsam.confidence import intervals
     from lasercal_gtsam.errors import (
         DataError,
         DegenerateError,

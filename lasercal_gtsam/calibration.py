@@ -276,6 +276,18 @@ class Calibration(FrozenData):
         known = CellUncertainty(self.cell, self.covariance, self.labels)
         return locate(known, np.asarray(uv, dtype=np.float64), on, by, sigma_px)
 
+    def interval(self, name: str, level: float = 0.95) -> tuple[float, float]:
+        """Confidence interval of a row from the likelihood, in its unit; see `lc.intervals`.
+
+        Raises
+        ------
+        DataError, SolveError
+            As for `lasercal_gtsam.intervals`.
+        """
+        from lasercal_gtsam.confidence import intervals
+
+        return intervals(self, [name], level=level)[name]
+
     def _parts(
         self, plane: str | None, camera: str | None, laser: str | None
     ) -> tuple[str, str, str]:
@@ -341,6 +353,15 @@ def sigma_decimals(sigma: float) -> int:
 def plain_number(value: float, decimals: int) -> str:
     """Number with that many decimals, never "-0.00"; empty where it is not finite."""
     return f"{round(value, decimals) + 0.0:.{decimals}f}" if np.isfinite(value) else ""
+
+
+def measured(value: float, sigma: float) -> str:
+    """``203 +- 73``: the sigma to two significant digits, the value to the same place."""
+    if not (np.isfinite(sigma) and sigma > 0):
+        return f"{value:.4g} +- {'0' if sigma == 0 else 'unknown'}"
+    place = 1 - int(np.floor(np.log10(float(f"{sigma:.1e}"))))
+    decimals = max(place, 0)
+    return f"{plain_number(round(value, place), decimals)} +- {round(sigma, place):.{decimals}f}"
 
 
 def text_table(lines: Sequence[tuple[str, ...]]) -> str:

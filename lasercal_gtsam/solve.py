@@ -11,7 +11,7 @@ import numpy as np
 from lasercal_gtsam.cell import Cell, Intrinsics
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CellGraph, state_from_cell
+from lasercal_gtsam.graph import CELL_KEY, CellGraph, state_from_cell
 from lasercal_gtsam.observability import SINGULAR, RangeSvd
 from lasercal_gtsam.report_map import tangent_labels
 
@@ -76,11 +76,11 @@ def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True
         raise SolveError(
             "the start is impossible: " + (_impossible(problem, problem.start) or "not finite")
         )
-    iterations, decrement = 0, np.inf
+    iterations, decrement, stopped = 0, np.inf, False
     search = find_scale and bool(problem.holds.priors)
     for _ in range(_MAX_SCALE_ROUNDS if search else 1):
         values, used = _optimise(problem, values, max_iterations)
-        iterations += used
+        iterations, stopped = iterations + used, used >= max_iterations
         values, decrement = _polish(problem, values)
         if not search:
             break
@@ -91,7 +91,8 @@ def solve(problem: CellGraph, max_iterations: int = 100, find_scale: bool = True
     cell = problem.cell(values)
     cost = problem.batch.total_loss(problem.state(values), problem.loss)
     total = 2.0 * float(problem.graph.error(values))
-    troubles = _troubles(problem, cell, cost, iterations, decrement, max_iterations)
+    limit = f", stopped by the limit of {max_iterations} for one solve" if stopped else ""
+    troubles = _troubles(problem, cell, cost, f"{iterations} iterations{limit}", decrement)
     return Solution(problem, cell, cost, total, iterations, decrement, troubles)
 
 
@@ -140,9 +141,8 @@ def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, flo
         linear = problem.graph.linearize(values)
         try:
             step = linear.optimize()
-        except RuntimeError:
-            refuse_if_singular(problem, values)
-            return values, np.inf
+        except RuntimeError:  # GTSAM's pivots know nothing of units
+            step = _scaled_step(problem, values, linear)
         decrement = float(np.sqrt(max(0.0, -step.dot(linear.gradientAtZero()))))
         if decrement < max(
             _POLISHED_SIGMAS * np.sqrt(2 * error / rows), 1e-6 * _ROUNDING_PX / problem.scale
@@ -156,6 +156,20 @@ def _polish(problem: CellGraph, values: gtsam.Values) -> tuple[gtsam.Values, flo
     return values, decrement
 
 
+def _scaled_step(
+    problem: CellGraph, values: gtsam.Values, linear: gtsam.GaussianFactorGraph
+) -> gtsam.VectorValues:
+    """Newton's step by a decomposition in plausible ranges; `DegenerateError` if singular."""
+    svd = refuse_if_singular(problem, values)
+    A, b = linear.jacobian()
+    root = svd.root()
+    step = np.zeros(problem.chart.n)
+    step[problem.free] = root @ (root.T @ (A[:, problem.free].T @ b))
+    found = gtsam.VectorValues()
+    found.insert(CELL_KEY, step)
+    return found
+
+
 def _data_scale(problem: CellGraph, values: gtsam.Values) -> float:
     cost = problem.batch.total_loss(problem.state(values), problem.loss)
     return float(np.sqrt(cost / max(degrees_of_freedom(problem, values), 1.0)))
@@ -165,9 +179,8 @@ def _troubles(
     problem: CellGraph,
     cell: Cell,
     cost: float,
-    iterations: int,
+    effort: str,
     decrement: float,
-    max_iterations: int,
 ) -> tuple[str, ...]:
     found: list[str] = []
     if not np.isfinite(cost):
@@ -175,10 +188,8 @@ def _troubles(
     rows = 2 * int(problem.batch.used.sum())
     sigma = max(np.sqrt(cost / rows), _ROUNDING_PX) / problem.scale
     if not decrement < CONVERGED_SIGMAS * sigma:
-        limit = f" (limit {max_iterations})" if iterations >= max_iterations else ""
         found.append(
-            f"not converged: one more step would move {decrement / sigma:.2g} sigma after "
-            f"{iterations} iterations{limit}"
+            f"not converged: one more step would move {decrement / sigma:.2g} sigma after {effort}"
         )
     impossible = _impossible(problem, cell)
     if impossible:

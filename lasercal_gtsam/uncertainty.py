@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from lasercal_factors.batch import Loss
 
-from lasercal_gtsam.calibration import Parameter, WeakDirection
+from lasercal_gtsam.calibration import Parameter, WeakDirection, measured
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import CellGraph, beam_frames, expansion, state_from_cell
@@ -90,7 +90,9 @@ def estimate_uncertainty(solution: Solution) -> Uncertainty:
     covariance = E @ free @ E.T
     covariance[~E.any(axis=1)] = 0.0  # what is held has none, even where the scale is unknown
     covariance[:, ~E.any(axis=1)] = 0.0
-    weak = weak_of.weak_directions(sigma=unit if unit > _EXACT else 1.0)
+    # of exact data the strength is that with the stated sigmas, whatever scale was settled on
+    exact = not sigma0 > _EXACT
+    weak = weak_of.weak_directions(sigma=1.0 / problem.scale if exact else unit)
     leverage = spot_leverages(problem, E @ svd.root())
     return Uncertainty(covariance, tangent_labels(solution.cell), sigma0, dof, weak, leverage)
 
@@ -184,8 +186,8 @@ def report_notes(cell: Cell, uncertainty: Uncertainty) -> list[str]:
         sigma = float(np.sqrt(max(uncertainty.covariance[i, i], 0.0)))
         if plane.distance < _NEAR_ORIGIN_SIGMAS * sigma:
             notes.append(
-                f"plane {name!r} passes the base origin at {MM_PER_M * plane.distance:.2g} +- "
-                f"{MM_PER_M * sigma:.2g} mm: do not read the sigmas of a_{name} one by one, use "
-                "its normal and distance"
+                f"plane {name!r} passes the base origin at "
+                f"{measured(MM_PER_M * plane.distance, MM_PER_M * sigma)} mm: do not read the "
+                f"sigmas of a_{name} one by one, use its normal and distance"
             )
     return notes

@@ -109,7 +109,7 @@ def write(
 
 def _by_likelihood(calibration: Calibration) -> Intervals:
     """95 % intervals of all rows that were estimated; `DataError` where there can be none."""
-    from lasercal_gtsam.intervals import intervals
+    from lasercal_gtsam.confidence import intervals
 
     names = [p.name for p in calibration.parameters if p.sigma > 0]
     found: dict[str, tuple[float, float]] = {}

@@ -25,8 +25,8 @@ import numpy as np
 from scipy.special import stdtrit
 
 import lasercal_gtsam as lc
+from lasercal_gtsam.confidence import likelihood_of
 from lasercal_gtsam.holds import resolve_holds
-from lasercal_gtsam.intervals import likelihood_of
 from lasercal_gtsam.profile import RowProfile
 from lasercal_gtsam.report_map import BeamChart, row_names, row_values
 from lasercal_gtsam.simulate import Noise, Simulation, simulate
