@@ -36,7 +36,7 @@ from lasercal_gtsam.report.html.page import SECTIONS, _asset, _by_sigma, _pad
 from lasercal_gtsam.report.html.palettes import CATEGORIES, sequential
 from lasercal_gtsam.report.html.pictures import residual_histogram, residual_vectors
 from lasercal_gtsam.report.html.planes import _rectangles, error_map, plane_coverage
-from lasercal_gtsam.report.html.scene import project
+from lasercal_gtsam.report.html.scene import EYE_DISTANCE, FILLING, NEAR, project
 from lasercal_gtsam.report.html.svg import element
 
 NASTY = (
@@ -341,6 +341,20 @@ def test_scene_is_projected_as_by_a_rotation() -> None:
     np.testing.assert_allclose(
         flat, np.column_stack([right, -up]) * (eye / (eye - depth))[:, None], atol=1e-12
     )
+
+
+def test_both_drawings_of_the_scene_share_their_constants() -> None:
+    stated = re.search(
+        r"EYE_DISTANCE = ([\d.]+), FILLING = ([\d.]+), NEAR = ([\d.]+);", _asset("viewer.js")
+    )
+    assert stated is not None
+    assert tuple(map(float, stated.groups())) == (EYE_DISTANCE, FILLING, NEAR)
+
+
+def test_table_ends_with_the_rms() -> None:
+    text = page_of("one camera")
+    table = text[text.index('id="parameters"') : text.index('id="rejected"')]
+    assert re.search(r">RMS</th>.*?>0\.1639</td>", table, re.S)
 
 
 def luminance(colour: str) -> float:
