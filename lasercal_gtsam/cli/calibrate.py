@@ -30,7 +30,7 @@ CALIBRATION_FILE = "calibration.json"
     short_help="Estimate the cell of a capture and save it with its sigmas.",
     epilog="Exit status: 0 saved; 1 wrong data, or an answer that cannot be trusted.",
 )
-@click.argument("capture", type=click.Path(path_type=Path))
+@click.argument("captures", metavar="CAPTURE...", type=click.Path(path_type=Path), nargs=-1)
 @click.option(
     "-o",
     "--output",
@@ -102,10 +102,51 @@ CALIBRATION_FILE = "calibration.json"
     help="Also write the uncertainty report, one HTML file; see 'lasercal report'.",
 )
 @intrinsics_options
+@click.option(
+    "-j",
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(min=1),
+    help="Several captures: so many at a time, each in its process.  [default: one for each core]",
+)
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Several captures: on the Dask scheduler there, whose workers see the same files.",
+)
 @json_option
 def calibrate(
+    captures: tuple[Path, ...],
+    output: Path | None,
+    page: Path | None,
+    as_json: bool,
+    jobs: int | None,
+    cluster: str | None,
+    **settings: Any,
+) -> int:
+    """Calibrate the cell of each CAPTURE (capture.yaml, or its folder) and save the result.
+
+    Prints the parameters with their sigmas, what was held, what was rejected and why. Spots without
+    pixels are looked for in their pictures. Of several captures each result goes beside its
+    capture, and a line is printed for each.
+    """
+    if not captures:
+        raise click.UsageError("Missing argument 'CAPTURE...'.")
+    if len(captures) > 1:
+        from lasercal_gtsam.cli.fleet import calibrate_many
+
+        return calibrate_many(captures, output, page, as_json, jobs, cluster, settings)
+    if jobs is not None or cluster is not None:
+        raise click.UsageError("--jobs and --cluster are for several captures; this is one")
+    return calibrate_one(captures[0], output, page, as_json, **settings)
+
+
+def calibrate_one(
     capture: Path,
     output: Path | None,
+    page: Path | None,
+    as_json: bool,
+    *,
     initial: Path | None,
     distortion: str | tuple[str, ...],
     known: tuple[tuple[str, Number], ...],
@@ -114,15 +155,9 @@ def calibrate(
     sigma_px: float | None,
     estimate_noise: bool,
     keep_unconverged: bool,
-    page: Path | None,
     lens: GivenLens,
-    as_json: bool,
 ) -> int:
-    """Calibrate the cell of CAPTURE (capture.yaml, or its folder) and save the result.
-
-    Prints the parameters with their sigmas, what was held, what was rejected and why. Spots without
-    pixels are looked for in their pictures.
-    """
+    """One capture, with the options of the command; returns the exit status."""
     from lasercal_gtsam.io.capture import load_capture
 
     loaded = load_capture(capture)
