@@ -17,6 +17,7 @@ room.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import comb, log
 
@@ -57,11 +58,34 @@ _SAME = 0.95
 
 @dataclass(frozen=True, eq=False)
 class Agreement:
-    """A consensus: beam direction (hand frame), the spots that agree, and how strongly."""
+    """A consensus of shots.
+
+    Attributes
+    ----------
+    u : (3,) beam direction, hand frame
+    members : numbers of the spots that agree, for each group; the smallest first
+    score : how many agree beyond chance, those near the limit counting less
+    """
 
     u: Array
-    rows: Index
+    members: tuple[Index, ...]
     score: float
+
+    @property
+    def rows(self) -> Index:
+        """Numbers of all spots that agree, in order."""
+        return np.sort(np.concatenate(self.members))
+
+    def parts(self) -> Iterator[Index]:
+        """All of them, then without one group each.
+
+        The smallest group first: it is the likeliest to have a wrong shot among its own.
+        """
+        yield self.rows
+        for left_out in range(len(self.members)):
+            others = self.members[:left_out] + self.members[left_out + 1 :]
+            if others:
+                yield np.sort(np.concatenate(others))
 
 
 def agreements(groups: Groups, seed: int = 0) -> list[Agreement]:
@@ -92,7 +116,8 @@ def agreements(groups: Groups, seed: int = 0) -> list[Agreement]:
             kept, score = consensus.agreeing(u, FINE)
         if not kept.any():
             continue
-        found.append(Agreement(u, np.sort(groups.rows[kept]), score))
+        members = [rows[own] for rows, own in zip(groups.rows, kept, strict=True) if own.any()]
+        found.append(Agreement(u, tuple(sorted(members, key=len)), score))
         best = max(agreement.score for agreement in found)
         if sum(agreement.score > _SAME * best for agreement in found) > 1:
             break

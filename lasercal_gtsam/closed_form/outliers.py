@@ -16,6 +16,7 @@ set aside.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -43,9 +44,9 @@ MOST_ASIDE = 0.5
 FITS = 0.0125
 """Share of the image diagonal within which a spot counts for a solution of a part of them."""
 _ROUNDS = 10
-# random parts of the spots that agree, the share of them, and the share of them that must fit a
-# solution for it to be good
-_AGREEMENTS, _PARTS, _PART_SHARE, _GOOD, _USABLE = 2, 10, 0.65, 0.8, 0.5
+# how many agreements are tried, and parts of each; the share of its spots that must fit a solution
+# for it to be good, and for it to be better than nothing
+_AGREEMENTS, _PARTS, _GOOD, _USABLE = 3, 12, 0.8, 0.4
 # solutions of a part that are judged by all spots
 _JUDGED = 6
 
@@ -163,18 +164,15 @@ class _Solver:
 
         None where no part of the shots that agree has one that half as many spots fit.
         """
-        rng = np.random.default_rng(0)
         for agreement in agreements(groups)[:_AGREEMENTS]:
-            rows, best = agreement.rows, None
-            for trial in range(_PARTS):
-                share = 1.0 if trial == 0 else _PART_SHARE
-                part = np.sort(rng.permutation(rows)[: int(np.ceil(share * len(rows)))])
+            count, best = len(agreement.rows), None
+            for part in islice(agreement.parts(), _PARTS):
                 one = self.solve(part, search=False)
                 if one is not None and (best is None or one.fit > best.fit):
                     best = one
-                if best is not None and best.fit > _GOOD * len(rows):
+                if best is not None and best.fit > _GOOD * count:
                     return best
-            if best is not None and best.fit > _USABLE * len(rows):
+            if best is not None and best.fit > _USABLE * count:
                 return best
         return None
 
