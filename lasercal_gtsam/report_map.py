@@ -117,7 +117,7 @@ def beam_rows(beam: Beam, chart: BeamChart) -> Array:
     else:
         # atan(u / uz), so that a beam against the axis has small tilts too, not +-180 deg
         angles = np.arctan2(np.copysign(1.0, u[2]) * u[:2], abs(u[2]))
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         crossing = np.delete(q - q[chart.axis] / u[chart.axis] * u, chart.axis)
     return np.concatenate([angles * DEG_PER_RAD, crossing * MM_PER_M])
 

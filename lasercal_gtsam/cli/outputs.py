@@ -10,6 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.io.files import check_regular, reason_of
 
 
 def check_writable(path: Path) -> None:
@@ -17,8 +18,11 @@ def check_writable(path: Path) -> None:
     folder = path.parent
     if not folder.is_dir():
         raise DataError(f"{path}: cannot be written: there is no folder {folder}; make it first")
-    if path.is_dir():
-        raise DataError(f"{path}: cannot be written: this is a folder, expected a file")
+    try:
+        if path.exists():
+            check_regular(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be written: {reason_of(error)}") from None
     if not os.access(folder, os.W_OK):
         raise DataError(f"{path}: cannot be written: no permission to write in {folder}; use -o")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Annotated, Any, TypeVar
 
@@ -35,11 +35,15 @@ from lasercal_gtsam.io.conventions import rotations_from_columns
 from lasercal_gtsam.io.wording import did_you_mean
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.report_map import tangent_labels
 from lasercal_gtsam.rotations import make_pose
 
 # Matrix and quaternion of one pose are the same rotation written twice; the matrix need not be
 # orthonormal to the last digit, the quaternion's always is.
 POSE_AGREEMENT = 10 * ROTATION_TOLERANCE
+
+# Of a length in metres, a pixel, a coefficient, a sigma: larger ones mean nothing, smaller are 0.
+LARGEST, SMALLEST = 1e12, 1e-100
 
 _INFINITIES = {"inf": math.inf, "-inf": -math.inf}
 
@@ -53,7 +57,17 @@ def _number(value: Any) -> Any:
     return _INFINITIES.get(value, value) if isinstance(value, str) else value
 
 
-def _array(*shape: int | None) -> Callable[[Any], Array]:
+def _ordinary(value: float) -> float:
+    """A number that can be squared and divided by; or NaN, where nothing is known."""
+    size = abs(value)
+    if size > LARGEST or 0 < size < SMALLEST:
+        raise ValueError(
+            f"expected 0 or a number between {SMALLEST:g} and {LARGEST:g} in size, got {value:g}"
+        )
+    return value
+
+
+def _array(*shape: int | None, largest: float = math.inf) -> Callable[[Any], Array]:
     wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
 
     def convert(value: Any) -> Array:
@@ -69,6 +83,8 @@ def _array(*shape: int | None) -> Callable[[Any], Array]:
             n not in (None, m) for n, m in zip(shape, array.shape, strict=True)
         ):
             raise ValueError(f"expected numbers of shape {wanted}, got shape {array.shape}")
+        if (np.abs(array) > largest).any():
+            raise ValueError(f"expected numbers up to {largest:g}, got {np.abs(array).max():g}")
         return array
 
     return convert
@@ -82,15 +98,16 @@ def _not_negative(value: float) -> float:
 
 Number = Annotated[float, BeforeValidator(_number)]
 Sigma = Annotated[float, BeforeValidator(_number), AfterValidator(_not_negative)]
-Vector2 = Annotated[Array, PlainValidator(_array(2))]
-Vector3 = Annotated[Array, PlainValidator(_array(3))]
-Vector4 = Annotated[Array, PlainValidator(_array(4))]
-Matrix44 = Annotated[Array, PlainValidator(_array(4, 4))]
+Ordinary = Annotated[float, BeforeValidator(_number), AfterValidator(_ordinary)]
+Vector2 = Annotated[Array, PlainValidator(_array(2, largest=LARGEST))]
+Vector3 = Annotated[Array, PlainValidator(_array(3, largest=LARGEST))]
+Vector4 = Annotated[Array, PlainValidator(_array(4, largest=LARGEST))]
+Matrix44 = Annotated[Array, PlainValidator(_array(4, 4, largest=LARGEST))]
 Matrix = Annotated[Array, PlainValidator(_array(None, None))]
-Rows2 = Annotated[Array, PlainValidator(_array(None, 2))]
-Rows4 = Annotated[Array, PlainValidator(_array(None, 4))]
-Rows16 = Annotated[Array, PlainValidator(_array(None, 16))]
-Size = Annotated[list[int], Field(min_length=2, max_length=2)]
+Rows2 = Annotated[Array, PlainValidator(_array(None, 2, largest=LARGEST))]
+Rows4 = Annotated[Array, PlainValidator(_array(None, 4, largest=LARGEST))]
+Rows16 = Annotated[Array, PlainValidator(_array(None, 16, largest=LARGEST))]
+Size = Annotated[list[Annotated[int, Field(gt=0, le=65535)]], Field(min_length=2, max_length=2)]
 
 
 class _Part(BaseModel):
@@ -132,15 +149,15 @@ class PoseModel(_Part):
 class IntrinsicsModel(_Part):
     """Intrinsics, all nine named."""
 
-    fu: Number
-    fv: Number
-    skew: Number
-    u0: Number
-    v0: Number
-    k1: Number
-    k2: Number
-    p1: Number
-    p2: Number
+    fu: Ordinary
+    fv: Ordinary
+    skew: Ordinary
+    u0: Ordinary
+    v0: Ordinary
+    k1: Ordinary
+    k2: Ordinary
+    p1: Ordinary
+    p2: Ordinary
 
 
 class CameraModel(_Part):
@@ -172,7 +189,7 @@ class PlaneModel(_Part):
     """One plane."""
 
     normal_base: Vector3
-    distance_m: Number
+    distance_m: Ordinary
 
     def build(self) -> Plane:
         """The plane."""
@@ -239,9 +256,9 @@ class NoiseLevelModel(_Part):
 class FitModel(_Part):
     """How the fit went."""
 
-    rms_px: Number
-    sigma0: Number
-    dof: Number
+    rms_px: Ordinary
+    sigma0: Ordinary
+    dof: Ordinary
     iterations: int
     converged: bool
     status: str
@@ -352,7 +369,9 @@ class CalibrationModel(CellModel):
         initial = self.initial.build_cell("initial.", problems)
         observations = _built("inputs.observations", self.inputs.observations.build, problems)
         options = _built("inputs.options", self.inputs.build_options, problems)
-        if cell is None or initial is None or observations is None or options is None:
+        if cell is not None and initial is not None and observations is not None:
+            problems += self._contradictions(cell, initial, observations)
+        if cell is None or initial is None or observations is None or options is None or problems:
             raise DataError(*problems)
         return Calibration(
             cell=cell,
@@ -369,6 +388,24 @@ class CalibrationModel(CellModel):
             ),
             inputs=Inputs(observations, options),
         )
+
+    def _contradictions(
+        self, cell: Cell, initial: Cell, observations: Observations
+    ) -> Iterator[str]:
+        """What no part of the file can show by itself."""
+        for kind in ("cameras", "lasers", "planes"):
+            apart = set(getattr(cell, kind)) ^ set(getattr(initial, kind))
+            if apart:
+                named = ", ".join(map(repr, sorted(apart)))
+                yield f"{kind}, initial.{kind}: {named} is in one of them only"
+        labels = self.covariance.labels
+        known = set(tangent_labels(cell))
+        odd = [label for label in labels if label not in known]
+        if odd or len(set(labels)) < len(labels):
+            found = f"{odd[0]!r:.60}" if odd else "a label twice"
+            yield f"covariance.labels: expected those of the cell's parts, got {found}"
+        if [spot.id for spot in self.spots] != observations.id.tolist():
+            yield "spots, inputs.observations: expected the same ids in the same order"
 
     def _spots(self) -> SpotResults:
         return SpotResults(

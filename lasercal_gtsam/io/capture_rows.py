@@ -72,7 +72,7 @@ def read_rows(head: CaptureHead, folder: Path) -> Rows:
     if head.spots is not None:
         spots = read_table(folder / head.spots.file, head.spots.file)
     rows = rows_of(head, poses, spots)
-    problems = [*poses.problems(), *(spots.problems() if spots else [])]
+    problems = [*poses.problems(), *([] if spots is None else spots.problems())]
     if problems:
         raise DataError(*problems)
     return rows

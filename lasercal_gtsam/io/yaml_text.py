@@ -13,7 +13,7 @@ Location = tuple[str | int, ...]
 
 # Far above what a person writes, far below what takes long: an alias that stands for lists of
 # aliases makes millions of values out of ten lines.
-_MOST_CHARACTERS, _MOST_VALUES, _DEEPEST = 4_000_000, 100_000, 50
+_MOST_CHARACTERS, _MOST_VALUES, _DEEPEST = 1_000_000, 100_000, 50
 
 
 class Lines:

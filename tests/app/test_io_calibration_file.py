@@ -57,6 +57,9 @@ def random_cell(rng: np.random.Generator, names: tuple[str, ...] = ("camera",)) 
     )
 
 
+LABELS = ("camera.rot_x", "camera.rot_y", "camera.trans_x", "plane 1.distance")
+
+
 def make(seed: int = 0, spots: int = 5, **changes: Any) -> Calibration:
     """A calibration with numbers of every kind; nothing in it is the result of a fit."""
     rng = np.random.default_rng(seed)
@@ -81,7 +84,7 @@ def make(seed: int = 0, spots: int = 5, **changes: Any) -> Calibration:
             Parameter("laser_z", 1e-300, -0.0, math.inf, "mm"),
         ),
         "covariance": A @ A.T,
-        "labels": ("fu", "fv", "Tx", "λ"),
+        "labels": LABELS,
         "fit": Fit(0.1 + 0.2, NAN, 3.5, 7, True, "converged: 5 spots", spots, 1),
         "spots": SpotResults(
             id=observations.id,
@@ -143,7 +146,7 @@ def test_any_float_survives(x: float, y: float) -> None:
     calibration = make(
         parameters=(Parameter("fu", x, y, abs(x), "px"),),
         covariance=np.array([[x, y], [y, 1.0]]),
-        labels=("a", "b"),
+        labels=LABELS[:2],
     )
     text = json.dumps(to_dict(calibration), allow_nan=False)
     assert CalibrationModel.model_validate(json.loads(text)).build() == calibration
