@@ -169,7 +169,9 @@ class SpotBatch:
     def _seen(self, state: State) -> Spots:
         if self.hand is None:
             return self.spots
-        spots: Spots = hand_kernels.hands_corrected(self.spots, state, *self.hand)
+        spots: Spots = hand_kernels.hands_corrected(
+            self.spots, state, *self.hand, np.zeros((len(self.order), 6))
+        )
         return spots
 
     def __len__(self) -> int:

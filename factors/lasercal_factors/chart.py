@@ -150,7 +150,9 @@ def _noisy(
     """Error and derivative of `LaserCellFactor` with the hand poses eliminated at every state."""
     n = chart.n
     variances, fixed = batch.hand or (np.zeros(6), np.ones(len(batch.order), np.bool_))
-    about = (chart.aspect_array, chart.reference, batch.spots, variances, fixed)
+    # corrections of the state before, where those of the next one are looked for
+    eta = np.zeros((len(batch.order), 6))
+    about = (chart.aspect_array, chart.reference, batch.spots, variances, fixed, eta)
 
     def error(values: Any) -> Array:
         e = np.zeros(n + 1)
