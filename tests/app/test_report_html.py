@@ -425,8 +425,8 @@ def test_numbers_line_up_on_the_decimal_point() -> None:
         pad = re.search(r"--pad:(\d+)", _pad(text, 3))
         return int(pad[1]) if pad else 0, "--point" in _pad(text, 3)
 
-    assert [lacking(t) for t in ("1.234", "-20.5", "7", "held", "")] == [
-        (0, False), (2, False), (3, True), (0, False), (0, False),
+    assert [lacking(t) for t in ("1.234", "-20.5", "7", "held", "", "0.00012")] == [
+        (0, False), (2, False), (3, True), (0, False), (0, False), (0, False),
     ]  # fmt: skip
     assert isinstance(_pad("1.2", 3), Markup)
 

@@ -137,7 +137,7 @@ def _places(rows: Sequence[Mapping[str, Any]], column: str) -> int:
 def _pad(text: str, places: int) -> Markup:
     """Style that moves a number left by the decimals that it lacks; words stay at the right."""
     decimals, point = numbers.tail(text)
-    if not any(c.isdigit() for c in text) or decimals == places:
+    if not any(c.isdigit() for c in text) or decimals >= places:
         return Markup("")
     lacks = Markup(' style="--pad:{}{}"')
     return lacks.format(places - decimals, "" if point else Markup(";--point:1"))
