@@ -89,7 +89,8 @@ def calibration_of(
     rejected = np.array(
         [
             _reason(length / estimate.sigma0, account.limit / estimate.sigma0)
-            if not length <= account.limit
+            # the limit of few spots may be infinite, as is the length of what cannot be
+            if not (length <= account.limit and length < np.inf)
             else None
             for length in lengths
         ],

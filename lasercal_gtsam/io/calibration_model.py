@@ -348,7 +348,10 @@ class InputsModel(_Part):
             raise DataError(
                 *(f"unknown option {name!r}{did_you_mean(name, allowed)}" for name in unknown)
             )
-        return CalibrationOptions(**{name: _tuples(v) for name, v in self.options.items()})
+        try:
+            return CalibrationOptions(**{name: _tuples(v) for name, v in self.options.items()})
+        except (TypeError, AttributeError) as error:  # a list or a mapping that is none
+            raise DataError(f"an option is of a wrong kind: {error}") from None
 
 
 class CalibrationModel(CellModel):

@@ -12,7 +12,64 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-NUMBERS = ["nan", "NaN", "inf", "-inf", "Infinity", "1e308", "-1e308", "1e300", "1e160", "1e155", "1e100", "1e16", "1e9", "1e6", "-1", "-0", "0", "0.0", "1", "2", "0.5", "1e-9", "1e-160", "1e-300", "1e-310", "5e-324", "1e999", "-1e999", "65535", "65536", "2147483648", "4294967296", "1000000000", "9223372036854775808", "18446744073709551616", "1e18", "1_000", "0x10", "1,5", "1.2.3", "+5", "--5", ".5", "5.", "1e", "1e+", "½", "１２", "٣", "0b1", "0o17", "1:30", "12e03", ".inf", ".nan", "1000000000000000000000000000000000000000"]
+NUMBERS = [
+    "nan",
+    "NaN",
+    "inf",
+    "-inf",
+    "Infinity",
+    "1e308",
+    "-1e308",
+    "1e300",
+    "1e160",
+    "1e155",
+    "1e100",
+    "1e16",
+    "1e9",
+    "1e6",
+    "-1",
+    "-0",
+    "0",
+    "0.0",
+    "1",
+    "2",
+    "0.5",
+    "1e-9",
+    "1e-160",
+    "1e-300",
+    "1e-310",
+    "5e-324",
+    "1e999",
+    "-1e999",
+    "65535",
+    "65536",
+    "2147483648",
+    "4294967296",
+    "1000000000",
+    "9223372036854775808",
+    "18446744073709551616",
+    "1e18",
+    "1_000",
+    "0x10",
+    "1,5",
+    "1.2.3",
+    "+5",
+    "--5",
+    ".5",
+    "5.",
+    "1e",
+    "1e+",
+    "½",
+    "１２",
+    "٣",
+    "0b1",
+    "0o17",
+    "1:30",
+    "12e03",
+    ".inf",
+    ".nan",
+    "1000000000000000000000000000000000000000",
+]
 WORDS = (
     "",
     " ",
@@ -314,14 +371,18 @@ def _value(rng: Random, old: Any) -> Any:
     number = isinstance(old, int | float) and not isinstance(old, bool) and abs(old) < 1e300
     if number and rng.random() < 0.7:
         return rng.choice(
-            (old * -1, old * 1000, old * 0.001, old + 1, old * (1 + 1e-7), 0, 1, -1, 1e9, 1e300, 1e155)
-            + (1e-300, 5e-324, 10**19, 10**400, float("nan"), float("inf"), str(old), [old], None)
-            + ("inf", "-inf", "nan", int(old), True, 2**31, 2**63)
-        )  # fmt: skip
+            [
+                *(-old, old * 1000, old * 0.001, old + 1, old * (1 + 1e-7), int(old), str(old)),
+                *(0, 1, -1, 1e9, 1e300, 1e155, 1e-300, 5e-324, 2**31, 2**63, 10**19, 10**400),
+                *(float("nan"), float("inf"), "inf", "-inf", "nan", [old], None, True),
+            ]
+        )
     return rng.choice(
-        (None, True, [], {}, "", 0, -1, 1.5, token(rng), [[]], [None], {"": {}}, [[1, 2], [3]], [old], "x")
-        + (token(rng), [old, old], {"a": old}, str(old)[:50], 10**30)
-    )  # fmt: skip
+        [
+            *(None, True, 0, -1, 1.5, 10**30, "", "x", token(rng), token(rng), str(old)[:50]),
+            *([], {}, [[]], [None], {"": {}}, [[1, 2], [3]], [old], [old, old], {"a": old}),
+        ]
+    )
 
 
 def spoil_yaml(rng: Random, content: bytes) -> bytes:
@@ -362,11 +423,11 @@ def _bomb(rng: Random) -> str:
 _YAML: Sequence[Callable[[Random], str]] = (
     _bomb,
     lambda rng: "known: " + "[" * rng.choice((10, 1000, 20000)),
-    lambda rng: "noise: " + "{a: " * rng.choice((10, 500, 5000)) + "1" + "}" * rng.choice((10, 500)),
+    lambda rng: "noise: " + "{a: " * rng.choice((10, 5000)) + "1" + "}" * rng.choice((10, 500)),
     lambda rng: "loop: &loop [*loop]",
     lambda rng: "known: &k {a: *k}",
     lambda rng: "planes: [" + ", ".join(f"p{k}" for k in range(rng.choice((1, 100, 3000)))) + "]",
-    lambda rng: f"known: {{{rng.choice(('fu', 'aspect', 'u0', 'k1', 'skew', 'cam.fu'))}: {token(rng)}}}",
+    lambda rng: f"known: {{{rng.choice(('fu', 'aspect', 'u0', 'k1', 'c.fu'))}: {token(rng)}}}",
     lambda rng: f"known: {{principal_point: [{token(rng)}, {token(rng)}]}}",
     lambda rng: f"noise: {{pixel: {token(rng)}, hand_translation_mm: {token(rng)}}}",
     lambda rng: f'images: {{on: "{token(rng)}", off: "{token(rng)}"}}',

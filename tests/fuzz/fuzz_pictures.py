@@ -222,7 +222,7 @@ ODD: Sequence[Callable[[], bytes]] = (
     lambda: b"P2\n64 48\n255\n" + b"7 " * (64 * 48),
     lambda: b"P2\n64 48\n255\n" + b"999999999999999999 " * (64 * 48),
     lambda: b"P4\n64 48\n" + bytes(64 * 48 // 8),
-    lambda: b"P7\nWIDTH 64\nHEIGHT 48\nDEPTH 1\nMAXVAL 255\nTUPLTYPE GRAYSCALE\nENDHDR\n" + bytes(3072),
+    lambda: b"P7\nWIDTH 64\nHEIGHT 48\nDEPTH 1\nMAXVAL 255\nENDHDR\n" + bytes(3072),
     lambda: b"Pf\n64 48\n-1.0\n" + bytes(64 * 48 * 4),
 )  # fmt: skip
 
