@@ -100,6 +100,7 @@ class IncrementalCalibrator:
         self._watchman = Watchman(self._store, Cell({}, {}, {}), 0.0, 0.0)
         self._initial = Cell({}, {}, {})
         self._words: tuple[str, ...] = ()
+        self._stops = False
         self._older = 0
         self._open: set[Named] = set()
         self._pending: list[int] = []
@@ -169,6 +170,7 @@ class IncrementalCalibrator:
             A camera's image size differs from what it was.
         """
         self._check_sizes(observations)
+        self._note_stops(observations)
         numbers = self._store.append(observations, self._settings.sigma_px)
         seen: list[Innovation | None] = [None] * len(numbers)
         if self._filter is None:
@@ -184,6 +186,9 @@ class IncrementalCalibrator:
                 self._let_go()
         self._last = self._update(numbers, seen)
         return self._last
+
+    def _note_stops(self, observations: Observations) -> None:
+        self._stops |= observations.stop is not None and bool((observations.stop != "").any())
 
     def reset(
         self, *, camera: str | None = None, laser: str | None = None, plane: str | None = None
@@ -242,6 +247,7 @@ class IncrementalCalibrator:
     def _go_on_from(self, calibration: Calibration) -> None:
         self._settings = self._settings.informed_by(calibration)
         fit, spots = calibration.fit, calibration.inputs.observations
+        self._note_stops(spots)
         if holds_its_spots(calibration):
             self._store.append(spots, self._settings.sigma_px)
             self._begin(calibration, _start_words(calibration))
@@ -486,6 +492,8 @@ class IncrementalCalibrator:
         store, first, end, older = self._store, self._store.first, self._store.end, self._older
         settings, limit = self._settings, self._filter.limit
         initial, words, missing, alarm = self._initial, self._words, self._missing, self._alarm
+        if self._stops and max(self._settings.hand) > 0:
+            words = (*words, _STOPS_APART)
         waiting = (*self._pending, *range(self._since, end)) if alarm else tuple(self._pending)
 
         def make() -> Calibration:
@@ -505,6 +513,12 @@ class IncrementalCalibrator:
             return calibration_of(estimate, spots, begin, account, settings.unit)
 
         return make
+
+
+_STOPS_APART = (
+    "spots of one stop count here as if each had an error of the hand of its own, so that the "
+    "sigmas are somewhat too small: 'lasercal calibrate' takes them together"
+)
 
 
 def _start_words(found: Calibration) -> str:

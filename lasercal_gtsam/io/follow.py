@@ -264,6 +264,9 @@ class CaptureFollower:
             plane=np.array([rows.planes[k] for k in which], dtype=np.str_),
             id=np.array([self._prefix + rows.ids[k] for k in which], dtype=np.str_),
             image_size=self.image_size,
+            stop=None
+            if rows.stops is None
+            else np.array([rows.stops[k] for k in which], dtype=np.str_),
         )
 
     # --- rows that were taken already -----------------------------------------------------------

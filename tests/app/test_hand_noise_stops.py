@@ -225,6 +225,16 @@ def test_stops_go_through_files(tmp_path):
     assert old.inputs.observations.stop is None and old.fit.noise == ()
 
 
+def test_a_running_calibration_says_that_it_takes_stops_apart():
+    truth, seen = seen_twice(8)
+    start = lc.calibrate(seen[seen.camera == "left"], initial=truth, options=options())
+    running = lc.IncrementalCalibrator(start)
+    assert any("spots of one stop" in words for words in running.calibration.observability.held)
+    apart = replace(seen, stop=None)[seen.camera == "left"]
+    running = lc.IncrementalCalibrator(lc.calibrate(apart, initial=truth, options=options()))
+    assert not any("spots of one stop" in words for words in running.calibration.observability.held)
+
+
 def test_judged_and_checked_as_calibrated():
     truth, seen = seen_twice(7)
     result = lc.calibrate(seen, initial=truth, options=options())
