@@ -27,6 +27,7 @@ from lasercal_gtsam.lens_choice import choose_lens
 from lasercal_gtsam.losses import THRESHOLDS
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
+from lasercal_gtsam.profile import Likelihood, bent_rows
 from lasercal_gtsam.random_parts import parts_of
 from lasercal_gtsam.reweight import refine_truncated, refine_with_loss
 from lasercal_gtsam.robust import (
@@ -219,6 +220,7 @@ def assemble(search: Search, accepted: Accepted, remarks: Sequence[str] = ()) ->
     finished, reasons, start, weights = accepted
     solution, sigma_px = finished.solution, finished.sigma_px
     uncertainty = estimate_uncertainty(solution)
+    bent = _bent_notes(solution, uncertainty, observations)
     if sigma_px is not None:  # found on the way; what is left of the scale is about 1
         uncertainty = replace(uncertainty, sigma0=sigma_px * uncertainty.sigma0)
     problem = solution.problem
@@ -232,6 +234,7 @@ def assemble(search: Search, accepted: Accepted, remarks: Sequence[str] = ()) ->
     notes = (
         *warnings,
         *report_notes(solution.cell, uncertainty),
+        *bent,
         *finished.words,
         *stop_notes(observations, options),
         *remarks,
@@ -256,6 +259,23 @@ def assemble(search: Search, accepted: Accepted, remarks: Sequence[str] = ()) ->
         observability=Observability(uncertainty.weak, problem.holds.words, notes),
         inputs=Inputs(observations, options),
     )
+
+
+def _bent_notes(
+    solution: Solution, uncertainty: Uncertainty, observations: Observations
+) -> list[str]:
+    """A word where sigmas, being linear, promise too much."""
+    if solution.troubles or solution.problem.loss.name != "none" or not uncertainty.dof >= 1:
+        return []
+    likelihood = Likelihood.of(solution, observations, uncertainty.sigma0, uncertainty.dof)
+    names = bent_rows(likelihood)
+    if not names:
+        return []
+    return [
+        f"{', '.join(names)}: the sigma itself changes by 15 % or more within one sigma, so that "
+        "twice the sigma need not hold 95 %; ask for the interval (calibration.interval, or "
+        "lasercal report), take more spots, or estimate fewer distortion terms"
+    ]
 
 
 def _fit(

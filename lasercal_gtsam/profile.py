@@ -27,14 +27,23 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.linalg import null_space
+from scipy.linalg import null_space, solve_triangular
 from scipy.special import stdtrit
 
+from lasercal_gtsam.cell import INTRINSIC_NAMES
 from lasercal_gtsam.errors import LasercalError
 from lasercal_gtsam.frozen import Array
-from lasercal_gtsam.graph import CELL_KEY, CellGraph, expansion, prior_factor, spread_columns
+from lasercal_gtsam.graph import (
+    CELL_KEY,
+    CellGraph,
+    beam_frames,
+    expansion,
+    prior_factor,
+    spread_columns,
+)
 from lasercal_gtsam.observations import Observations
-from lasercal_gtsam.report_map import BeamChart
+from lasercal_gtsam.options import DISTORTION_NAMES
+from lasercal_gtsam.report_map import CAMERA_ROWS, BeamChart, row_jacobian, row_names
 from lasercal_gtsam.solve import Solution, refuse_if_singular
 from lasercal_gtsam.table_row import TableRow
 
@@ -47,6 +56,9 @@ _HALVINGS = 14
 _SMALL_ROOT = 0.9
 # Gauss-Newton step at which such a root is known well enough
 _ROUGH = 0.03
+# relative change of a sigma within one sigma from which on a row counts as bent
+_BENT = math.log(1.15)
+INTRINSIC_ROWS = tuple(name for name, _ in CAMERA_ROWS[: len(INTRINSIC_NAMES)])
 _MAX_TRIES, _PRECISION, _FARTHEST = 25, 2e-3, 30.0
 
 
@@ -335,6 +347,34 @@ class RowProfile:
         H = 0.5 * (H + H.T)
         others = null_space(g[None, :])
         return H if np.linalg.eigvalsh(others.T @ H @ others)[0] > 0 else None
+
+
+def bent_rows(likelihood: Likelihood) -> tuple[str, ...]:
+    """Rows whose sigmas are not to be taken for straight: they change by 15 % within one sigma.
+
+    Looked for along the intrinsics, each moved by its sigma both ways with all else following. The
+    lens is what bends: without a distortion term to estimate nothing is looked for.
+    """
+    cell, basis = likelihood.problem.start, likelihood.basis
+    charts = {name: BeamChart.of(beam) for name, beam in cell.lasers.items()}
+    names = [name for name, _ in row_names(cell, charts)]
+    F = row_jacobian(cell, charts, beam_frames(cell)) @ basis
+    sizes = np.linalg.norm(F, axis=1)
+    free = np.flatnonzero(sizes > 0)
+    movable = [i for i in free if names[i].rpartition(".")[2] in INTRINSIC_ROWS]
+    if not any(names[i].rpartition(".")[2] in DISTORTION_NAMES for i in movable):
+        return ()
+    change = np.zeros(len(names))
+    for i in movable:
+        for side in (-1.0, 1.0):
+            try:
+                root = np.linalg.cholesky(likelihood.linearized(side * F[i] / sizes[i])[1])
+            except (LasercalError, RuntimeError, np.linalg.LinAlgError):
+                change[i] = np.inf  # no spot can be there
+                continue
+            moved = np.linalg.norm(solve_triangular(root, F[free].T, lower=True), axis=0)
+            change[free] = np.maximum(change[free], np.abs(np.log(moved / sizes[free])))
+    return tuple(name for name, c in zip(names, change, strict=True) if c > _BENT)
 
 
 def _constrained_step(H: Array, gradient: Array, g: Array, missing: float) -> tuple[Array, float]:

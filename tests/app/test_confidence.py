@@ -217,3 +217,23 @@ def test_a_prior_on_an_angle_that_is_not_defined_is_refused():
     options = replace(PLAIN, priors={"laser_theta": (0.0, 1.0)})
     with pytest.raises(lc.DataError, match="give laser_tilt_x"):
         lc.calibrate(made.observations, initial=made.truth, options=options)
+
+
+@pytest.mark.parametrize(
+    ("preset", "pixel_px", "distortion", "bent", "straight"),
+    [
+        ("table2-4", 1.98, "all", {"k2", "u0", "phi"}, {"Tx", "laser_y", "a_1_x", "fu"}),
+        ("paper", 0.2, "all", set(), {"k2", "u0"}),
+        ("paper", 1.0, "none", set(), {"u0"}),
+    ],
+)
+def test_rows_that_bend_are_named_and_no_others(preset, pixel_px, distortion, bent, straight):
+    """The rows whose intervals by sigma fail in the study of coverage, and those that do not."""
+    made = simulated(preset, 2, pixel_px)
+    options = replace(PLAIN, known=made.known, distortion=distortion)
+    result = lc.calibrate(made.observations, initial=made.truth, options=options)
+    notes = [n for n in result.observability.notes if "sigma itself changes" in n]
+    named = set(notes[0].partition(":")[0].split(", ")) if notes else set()
+    assert bent <= named
+    assert not named & straight
+    assert bool(notes) == bool(bent)

@@ -354,7 +354,6 @@ def test_a_prior_weighs_as_one_more_measurement():
         ({"priors": {"Tz": 430}}, r"options\.priors\['Tz'\]: expected \(mean, sigma\)"),
         ({"priors": {"Tz": (430, 0)}}, r"a sigma > 0"),
         ({"known": {"u0": 1}, "priors": {"u0": (1, 1)}}, "u0 is held"),
-        ({"distortion": "auto"}, r"options\.distortion: 'auto' is not available"),
     ],
 )
 def test_wrong_wishes_are_refused_in_words(fields, words):

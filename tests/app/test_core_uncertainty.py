@@ -60,4 +60,4 @@ def test_a_plane_near_the_base_origin_gets_a_remark() -> None:
     near = dict(solution.cell.planes)
     near["3"] = lc.Plane(near["3"].normal_base, 1e-4)
     (note,) = report_notes(solution.cell.with_planes(near), uncertainty)
-    assert "plane '3' passes the base origin at 0.1 +-" in note
+    assert "plane '3' passes the base origin at 0.10 +- 0.86 mm" in note
