@@ -45,6 +45,8 @@ POSE_AGREEMENT = 10 * ROTATION_TOLERANCE
 # Of a length in metres, a pixel, a coefficient, a sigma: larger ones mean nothing, smaller are 0.
 LARGEST, SMALLEST = 1e12, 1e-100
 
+_LARGEST_WHOLE = 10**300  # more do not fit into a float
+
 _INFINITIES = {"inf": math.inf, "-inf": -math.inf}
 
 T = TypeVar("T")
@@ -54,6 +56,8 @@ def _number(value: Any) -> Any:
     """JSON has no NaN and no infinity: null and two words stand for them."""
     if value is None:
         return math.nan
+    if isinstance(value, int) and not isinstance(value, bool) and abs(value) > _LARGEST_WHOLE:
+        raise ValueError("expected a number, got a whole number with hundreds of digits")
     return _INFINITIES.get(value, value) if isinstance(value, str) else value
 
 
@@ -75,7 +79,7 @@ def _array(*shape: int | None, largest: float = math.inf) -> Callable[[Any], Arr
             raise ValueError(f"expected a list of numbers of shape {wanted}, got {value!r:.60}")
         try:
             array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
             raise ValueError(f"expected numbers of shape {wanted}, got {value!r:.60}") from None
         if not array.size:
             array = array.reshape([0 if n is None else n for n in shape] if None in shape else -1)

@@ -17,6 +17,12 @@ from fuzz_pictures import HEIGHT, WIDTH, encoded, spoilt, spot
 SMALL = ("--preset", "paper-1", "--groups", "3", "--shots", "4")
 FAST = ("--initial", "spots/truth.json", "--robust", "none", "--distortion", "none")
 PICTURES = 2
+LENSES = {
+    "ros-camera-info": "camera.yaml",
+    "kalibr": "chain.yaml",
+    "opencv": "storage.yml",
+    "mrcal": "lens.cameramodel",
+}
 _FIRST = (
     ("calibrate", "two", "--robust", "huber", "-o", "first.json"),
     ("calibrate", "spots", "--distortion", "k1", "-o", "first.json"),
@@ -53,6 +59,10 @@ def make_corpus(folder: Path) -> dict[str, bytes]:
         _run("calibrate", "two", "--initial", "two/truth.json", "--distortion", "none")
         _with_spot_table()
         _with_pictures()
+        _with_recording()
+        Path("lens").mkdir()
+        for form, name in LENSES.items():
+            _run("export", "spots/calibration.json", form, "-o", f"lens/{name}")
         more = _renamed(Path("spots"), "more")
         _run("watch", more, "--calibration", "spots/calibration.json", "--once")
         for args in _FIRST:  # compiles what inputs will need, which must not count as their time
@@ -111,6 +121,16 @@ def _with_pictures() -> None:
         for name, lit in ((f"p{k}", True), (f"p{k}_off", False)):
             (folder / "images" / f"{name}.png").write_bytes(encoded(".png", spot(k, lit)))
     (folder / "poses.csv").write_text("\n".join([*lines, ""]))
+
+
+def _with_recording() -> None:
+    """Pictures named by their stamps, and a pose file of 10 Hz beside them."""
+    Path("recording").mkdir()
+    for k in range(2):
+        picture = encoded(".png", spot(k))
+        Path(f"recording/{k}.45.png").write_bytes(picture)
+    lines = [f"{0.1 * k:.1f} 0.5 0.1 {0.3 + 0.01 * (k // 10)} 1 0 0 0" for k in range(31)]
+    Path("poses.tum").write_text("\n".join([*lines, ""]))
 
 
 # --- the inputs ---------------------------------------------------------------------------------
@@ -299,6 +319,32 @@ def picture(rng: Random, corpus: Corpus) -> Input:
     return Input("picture", ("detect", "pictures"), {name: spoilt(rng)}, results=results)
 
 
+def lens(rng: Random, corpus: Corpus) -> Input:
+    name = f"lens/{rng.choice(list(LENSES.values()))}"
+    content = (
+        spoil_yaml(rng, corpus[name]) if rng.random() < 0.5 else spoil_bytes(rng, corpus[name])
+    )
+    args, results = _calibrate("spots")
+    return Input("lens file", (*args, "--intrinsics", name), {name: content}, results=results)
+
+
+def export(rng: Random, corpus: Corpus) -> Input:
+    name = "spots/calibration.json"
+    form = rng.choice((*LENSES, "ros-pose", "ros2-tf", "urdf", "json", "npz"))
+    args = ("export", name, form, "-o", "out.x")
+    return Input("export", args, {name: spoil_json(rng, corpus[name])}, results=("out.x",))
+
+
+def recording(rng: Random, corpus: Corpus) -> Input:
+    if rng.random() < 0.7:
+        files = {"poses.tum": spoil_bytes(rng, corpus["poses.tum"])}
+    else:
+        files = {"recording/0.45.png": spoilt(rng)}
+    how = ("--pose-format", "tum", "--transform", "T_base_hand", "--names", "s", "--plane", "1")
+    args = ("import", "recording", "--poses", "poses.tum", *how, "--laser-on", "--dry-run")
+    return Input("recording", args, files)
+
+
 def options(rng: Random, corpus: Corpus) -> Input:
     """Odd values of options, mostly for commands that end soon."""
     word = token(rng).replace("\0", "")
@@ -350,6 +396,9 @@ KINDS: Mapping[Callable[[Random, Corpus], Input], float] = {
     stdin: 6,
     picture: 12,
     options: 3,
+    lens: 4,
+    export: 3,
+    recording: 4,
 }
 
 
