@@ -67,7 +67,8 @@ def uncertainty_of(estimate: Estimate, unit: float = 1.0) -> Uncertainty:
 
 def parameters_of(estimate: Estimate, initial: Cell) -> tuple[Parameter, ...]:
     """Rows of the table."""
-    return table_parameters(estimate.cell, initial, uncertainty_of(estimate))
+    cell = estimate.cell
+    return table_parameters(cell, initial.restricted(cell), uncertainty_of(estimate))
 
 
 def calibration_of(
@@ -114,7 +115,7 @@ def calibration_of(
     return Calibration(
         cell=cell,
         initial=account.initial,
-        parameters=table_parameters(cell, account.initial, uncertainty),
+        parameters=table_parameters(cell, account.initial.restricted(cell), uncertainty),
         covariance=uncertainty.covariance,
         labels=uncertainty.labels,
         fit=fit,
