@@ -15,8 +15,10 @@ from threading import Lock
 _STDERR = 2
 # libpng; libjpeg's messages (jerror.h) about data; OpenCV's log
 _OURS = re.compile(
-    r"libpng (error|warning): |Corrupt |Premature end of JPEG|Invalid |Inconsistent progression |"
-    r"Warning: unknown JFIF|Application transferred too |Unknown Adobe color|Unsupported |Bogus |"
+    r"libpng (error|warning): |Corrupt JPEG|Premature end of JPEG|Inconsistent progression |"
+    r"Invalid (SOS|progressive|scan|component|crop|JPEG|memory) |"
+    r"Warning: unknown JFIF|Application transferred too |Unknown Adobe color|Bogus |"
+    r"Unsupported (JPEG|marker|color) |"
     r"Quantization table |Huffman table |Arithmetic table |Sorry, |Not a JPEG|Empty (JPEG|input)|"
     r"Maximum supported image|Too many color comp|Image too wide|\[ ?(WARN|ERROR|INFO):"
 )
