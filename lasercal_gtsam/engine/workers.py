@@ -7,6 +7,9 @@ All of them are `concurrent.futures.Executor`; nothing else of them is used, so 
 from __future__ import annotations
 
 import os
+import pickle
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
@@ -152,14 +155,29 @@ def _lost_cluster() -> tuple[type[BaseException], ...]:
     return KilledWorker, CommClosedError, CancelledError
 
 
-def apart(function: Callable[[], T]) -> T:
-    """Call a function in a fresh process of its own, and wait for it.
+def apart(function: Callable[..., object], *args: object) -> None:
+    """Call a function in a fresh Python of its own, and wait for it.
 
-    For what should not leave traces here: the process that compiles a kernel may get another last
-    digit from it than all that load it afterwards, so a study compiles before it begins.
+    For what should leave its traces on the disk only: see `lasercal_gtsam.study`. Function and
+    arguments are pickled; unlike a process pool it asks nothing of the calling script.
+
+    Raises
+    ------
+    SolveError
+        It failed there; says how.
     """
-    with Processes(1).open() as executor:
-        return executor.submit(function).result()
+    program = "import pickle, sys; f, a = pickle.load(sys.stdin.buffer); f(*a)"
+    paths = [path for path in sys.path if path]
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        input=pickle.dumps((function, args)),
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), **dict.fromkeys(_THREADS, "1")},
+        check=False,
+    )
+    if done.returncode:
+        words = done.stderr.decode(errors="replace").strip().splitlines() or ["nothing was said"]
+        raise SolveError(f"a run in a process of its own failed: {words[-1]}")
 
 
 class _AtOnce(Executor):

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from lasercal_gtsam.engine import Processes, Progress, Results, Work, Workers, apart, run_all
+from lasercal_gtsam.engine import Progress, Results, Work, Workers, apart, run_all
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.simulate.presets import preset_named
 from lasercal_gtsam.study import fig6_runs as _fig6
@@ -238,10 +238,18 @@ def _run(
     progress: Show | None,
 ) -> Results:
     work = Work(name, function, spec, runs)
-    # The process that compiles the kernels may get another last digit than those that load them,
-    # and with it another digest: so another process compiles, and every worker loads.
-    first = partial(apart, partial(function, spec, 0)) if isinstance(workers, Processes) else None
-    return run_all(work, workers, journal=journal, progress=progress, prepare=first)
+    return run_all(work, workers, journal=journal, progress=progress, prepare=_compile_kernels)
+
+
+@cache
+def _compile_kernels() -> None:
+    """Let another process compile the kernels, if nobody has: this one and all workers load them.
+
+    The process that compiles may get another last digit than those that load, and with it another
+    digest.
+    """
+    spec = {"cell": StudyCell().to_plain(), "levels": [0.5], "entropy": 0}
+    apart(_fig6.fig6_run, {**spec, "methods": list(_fig6.METHODS[:6])}, 0)
 
 
 def _check(trials: int, seed: int) -> None:

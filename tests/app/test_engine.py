@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -146,8 +145,11 @@ def test_what_json_cannot_say_is_refused():
         Work("draws", draw, SPEC, -1)
 
 
-def test_apart_is_another_process():
-    assert apart(os.getpid) != os.getpid()
+def test_apart_is_another_process(tmp_path):
+    apart(draw, {**SPEC, "folder": str(tmp_path)}, 4)
+    assert times_run(tmp_path, 5) == [0, 0, 0, 0, 1]
+    with pytest.raises(SolveError, match="a run in a process of its own failed: ZeroDivisionError"):
+        apart(fail, {}, 5)
 
 
 def test_progress_tells_how_long_it_takes():
