@@ -22,6 +22,8 @@ _FEWEST = 8
 # a residual that the fit takes nearly whole says nothing of the noise
 _LEAST_SHARE = 0.05
 _CHUNK = 512
+# more groups than any program of motions has; the time of their test grows with the cube
+_MOST_GROUPS = 200
 
 
 @dataclass(frozen=True)
@@ -152,7 +154,7 @@ def _by_distance(bench: Bench) -> tuple[float, float] | None:
 
 def _by_group(bench: Bench) -> tuple[float, float] | None:
     count = int(bench.group.max()) + 1
-    if count < 2 or 2 * count > len(bench):
+    if count < 2 or 2 * count > len(bench) or count > _MOST_GROUPS:
         return None
     mine = bench.group[:, None] == np.arange(count)
     return _f(bench, np.asarray(np.kron(1.0 * mine[:, None, :], np.eye(2)[None])))
