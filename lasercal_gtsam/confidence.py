@@ -47,7 +47,7 @@ def intervals(
         No such row, or one that is held; a calibration that is not to be trusted, states no sigmas,
         does not hold its spots, or was made with a loss; or the level is not between 0 and 1.
     SolveError
-        The calibration's own spots cannot be solved again.
+        The spots cannot be solved again, or the search for an end does not settle.
     """
     if not (isinstance(level, float | int) and 0.0 < level < 1.0):
         raise DataError(f"{_WHO}: level: expected a number between 0 and 1, got {level!r}")

@@ -31,7 +31,7 @@ from scipy.linalg import null_space, solve_triangular
 from scipy.special import stdtrit
 
 from lasercal_gtsam.cell import INTRINSIC_NAMES
-from lasercal_gtsam.errors import LasercalError
+from lasercal_gtsam.errors import LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import (
     CELL_KEY,
@@ -234,6 +234,11 @@ class RowProfile:
         """The value below (``side`` -1) or above (+1) whose adjusted root is ``limit``.
 
         Infinite where the likelihood does not fall far enough on that side.
+
+        Raises
+        ------
+        SolveError
+            The search does not settle.
         """
         near, near_at, start = 0.0, 0.0, np.zeros(self.likelihood.size)
         far: float | None = None
@@ -261,7 +266,10 @@ class RowProfile:
                 reach = min(step, 0.5 * (near + far)) if far is not None else step
             if reach > _FARTHEST:
                 return side * math.inf
-        return value
+        raise SolveError(
+            f"{self.row.name}: no end of the interval was found {'above' if side > 0 else 'below'} "
+            f"{self.estimate:.6g} in {_MAX_TRIES} tries"
+        )
 
     def _difference(self, value: float) -> float:
         return self.row.difference(value, self.estimate)
