@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,9 @@ from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.observations import Names, Observations
 from lasercal_gtsam.options import HAND_NOISE_NAMES, CalibrationOptions
 from lasercal_gtsam.prediction import CellUncertainty, locate, only, predict
+
+if TYPE_CHECKING:
+    from lasercal_gtsam.plot.plots import Plots
 
 
 @dataclass(frozen=True)
@@ -308,6 +311,13 @@ class Calibration(FrozenData):
         from lasercal_gtsam.report.file import report
 
         report(self, path, document=document)
+
+    @property
+    def plot(self) -> Plots:
+        """Figures with Matplotlib: ``plot.residuals()``, ``.coverage()``, ``.error_map()`` ..."""
+        from lasercal_gtsam.plot.plots import Plots
+
+        return Plots(self)
 
     def to_dict(self) -> dict[str, Any]:
         """The content of ``calibration.json``."""

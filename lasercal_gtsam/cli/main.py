@@ -25,6 +25,7 @@ from lasercal_gtsam.cli.history import history
 from lasercal_gtsam.cli.importing import import_recording
 from lasercal_gtsam.cli.judge import judge
 from lasercal_gtsam.cli.plan import plan
+from lasercal_gtsam.cli.plot import plot
 from lasercal_gtsam.cli.report import report
 from lasercal_gtsam.cli.simulate import simulate
 from lasercal_gtsam.cli.study import study
@@ -57,6 +58,7 @@ for _command in (
     check_sigma,
     judge,
     report,
+    plot,
     import_recording,
     detect,
     update,
