@@ -39,8 +39,8 @@ class CalibrationOptions:
     distortion
         Which distortion terms are estimated: ``"all"``, ``"none"``, names out of
         ``k1 k2 p1 p2``, or ``"auto"``: those that the spots can carry, by an information criterion
-        (`lens_choice`), with the reason in the notes. The others are held at the start's value
-        (zero without one).
+        (`lens_choice`), with the reason in the notes; a running calibration keeps those it began
+        with. The others are held at the start's value (zero without one).
     known
         Values held fixed: ``principal_point`` (u0, v0), ``skew`` (px), ``aspect`` (fu / fv), and
         any intrinsic by name (``fu fv u0 v0 k1 k2 p1 p2``). With several cameras
