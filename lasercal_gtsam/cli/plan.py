@@ -97,7 +97,7 @@ if TYPE_CHECKING:
     "--clearance-mm",
     metavar="X",
     type=click.FloatRange(min=0),
-    help="Least distance of the hand from every plane.",
+    help="Least distance of the hand from the plane it points at.",
 )
 @click.option(
     "--distortion",

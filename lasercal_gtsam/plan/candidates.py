@@ -96,6 +96,6 @@ def _one_rotation(
     design = MotionDesign(
         min_ahead=0.5 * limits.beam_length[0], depth=limits.depth, margin_px=limits.margin_px - 1e-6
     )
-    good = np.isfinite(spots).all(axis=1) & limits.allow(cell, camera, T)
+    good = np.isfinite(spots).all(axis=1) & limits.allow(cell, camera, plane, T)
     good[good] = spot_in_view(seen, beam, part, T[good, :3, :3], T[good, :3, 3], design)
     return T[good]

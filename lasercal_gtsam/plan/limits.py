@@ -36,7 +36,8 @@ class Limits(FrozenData):
     depth : range of the spot's depth before the camera
     box : ((x, y, z) lowest, (x, y, z) highest) of the hand's positions; None: anywhere
     reach : range of the hand's distance from the base's origin; None: any
-    clearance : least distance of the hand's origin from every plane, on the camera's side
+    clearance : least distance of the hand's origin from the plane that it points at, on the
+        camera's side; other planes end somewhere, nobody says where
 
     Raises
     ------
@@ -79,8 +80,8 @@ class Limits(FrozenData):
         if problems:
             raise DataError(*(f"plan: {p}" for p in problems))
 
-    def allow(self, cell: Cell, camera: str, T_base_hand: Array) -> Mask:
-        """Which of the poses (N, 4, 4) the hand may take, (N,)."""
+    def allow(self, cell: Cell, camera: str, plane: str, T_base_hand: Array) -> Mask:
+        """Which of the poses (N, 4, 4) the hand may take to point at ``plane``, (N,)."""
         t = T_base_hand[:, :3, 3]
         good = np.ones(len(t), dtype=np.bool_)
         if self.box is not None:
@@ -90,8 +91,7 @@ class Limits(FrozenData):
             distance = np.linalg.norm(t, axis=1)
             good &= (distance >= self.reach[0]) & (distance <= self.reach[1])
         if self.clearance > 0:
-            centre = cell.cameras[camera].T_base_camera[:3, 3]
-            for plane in cell.planes.values():
-                side = np.sign(plane.normal_base @ centre - plane.distance)
-                good &= side * (t @ plane.normal_base - plane.distance) >= self.clearance
+            centre, part = cell.cameras[camera].T_base_camera[:3, 3], cell.planes[plane]
+            side = np.sign(part.normal_base @ centre - part.distance)
+            good &= side * (t @ part.normal_base - part.distance) >= self.clearance
         return good

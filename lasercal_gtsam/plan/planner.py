@@ -241,7 +241,7 @@ def procedure(
         for _ in range(50):
             view = cell.cameras[problem.camera], cell.lasers[problem.laser], part
             group = plan_motions(*view, 1, SHOTS, design, rng)[0]
-            if limits.allow(cell, problem.camera, group).all():
+            if limits.allow(cell, problem.camera, name, group).all():
                 found.append(group)
             if len(found) == groups:
                 break

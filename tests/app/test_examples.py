@@ -51,6 +51,8 @@ def test_every_script_is_listed_and_tested():
         "2_use_result.py",
         "3_own_graph.py",
         "4_keep_calibrated.py",
+        "5_plan.py",
+        "6_hand_over.py",
     ]
     readme = (EXAMPLES / "README.md").read_text()
     assert all(f"`{script}`" in readme for script in scripts)
@@ -118,6 +120,27 @@ def test_4_keep_calibrated_names_the_bump_and_mends_it(out):
     assert abs(turn - 0.5) < 3 * sigma_turn
     last = text.splitlines()[-1].split()
     assert last[0] == "300" and "300 used" in text
+
+
+def test_5_plan_beats_the_procedure_and_is_a_capture(out):
+    text = run("5_plan.py", out)
+    pairs = re.findall(rf"plane \d: ({NUMBER}) mm from 36 .*, ({NUMBER}) mm from 30", text)
+    assert len(pairs) == 3
+    assert all(float(ours) < 0.6 * float(papers) for ours, papers in pairs)
+    assert (out / "plan" / "capture.yaml").exists()
+    assert "36 of 36 spots were in view: converged" in text
+    steps = re.findall(rf"would take ({NUMBER}) mm to ({NUMBER}) mm", text)
+    assert len(steps) == 3
+    assert all(float(after) < float(before) for before, after in steps)
+
+
+def test_6_hand_over_writes_what_it_says(out):
+    text = run("6_hand_over.py", out)
+    for name in ("cell.urdf", "cell.launch.xml", "camera_pose.yaml", "camera.yml", "cell.json"):
+        assert name in text
+        assert (out / name).stat().st_size > 100
+    assert float(re.search(rf"error ({NUMBER})", text)[1]) < 1e-6
+    assert (out / "report.html").read_text().startswith("<!doctype html>")
 
 
 def test_the_start_from_drawings_leads_to_the_same_answer(capsys, tmp_path):
