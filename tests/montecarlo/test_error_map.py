@@ -17,4 +17,4 @@ def test_located_points_scatter_as_the_map_says():
     assert len(found.planes) == 3
     assert all(plane.inside.sum() == POINTS for plane in found.planes)
     ratios = found.ratios()
-    assert 0.9 < ratios.min() and ratios.max() < 1.1
+    assert ratios.min() > 0.9 and ratios.max() < 1.1
