@@ -13,7 +13,7 @@ import numpy.typing as npt
 from lasercal_gtsam.cell import Cell
 from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.observations import Names, Observations
-from lasercal_gtsam.options import HAND_NOISE_NAMES, CalibrationOptions
+from lasercal_gtsam.options import DISTORTION_NAMES, HAND_NOISE_NAMES, CalibrationOptions
 from lasercal_gtsam.prediction import CellUncertainty, locate, only, predict
 
 if TYPE_CHECKING:
@@ -209,8 +209,18 @@ class Calibration(FrozenData):
 
     @property
     def options_used(self) -> CalibrationOptions:
-        """The options with the hand's noise that was estimated as if it had been stated."""
-        return with_levels(self.inputs.options, self.fit.noise)
+        """The options with what was found (hand noise, "auto" distortion) as if it was stated."""
+        options = with_levels(self.inputs.options, self.fit.noise)
+        if options.distortion != "auto":
+            return options
+        at = {label: i for i, label in enumerate(self.labels)}
+        left_out = {
+            f"{name}.{term}": getattr(camera.intrinsics, term)
+            for name, camera in self.cell.cameras.items()
+            for term in DISTORTION_NAMES
+            if (i := at.get(f"{name}.{term}")) is not None and self.covariance[i, i] == 0.0
+        }
+        return replace(options, distortion="all", known={**left_out, **options.known})
 
     def table(self) -> str:
         """Text of the paper's Table 2: Initial | Refined | sigma | Unit, RMS row last."""

@@ -182,6 +182,10 @@ def test_the_result_can_be_checked_saved_and_continued(tmp_path):
     result.save(tmp_path / "c.json")
     again = lc.load_calibration(tmp_path / "c.json")
     assert again.observability == result.observability
+    assert again.options_used.distortion == "all"
+    assert again.options_used.known == {f"camera.{t}": 0.0 for t in ("k2", "p1", "p2")}
+    verdict = lc.judge(again)
+    assert "weak-distortion" not in [reason.code for reason in verdict.reasons]
     check = lc.check_sigma(again, trials=20)
     assert {row.name for row in check.rows} >= {"fu", "k1"}
     assert "k2" not in {row.name for row in check.rows}
