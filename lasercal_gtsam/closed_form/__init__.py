@@ -20,6 +20,8 @@ camera from points and planes                `camera`                    -
 parts that no pair gives alone               `complete`                  (9), (12), (14)
 what the data must hold                      `requirements`              ranks of (27), (30), (53)
 rank and weight of the whole                 `information`               residual (55)
+shots that agree, among outliers             `agreement`, `samples`,     (16), (17), (23)
+                                             `lost_planes`
 order of the stages, outliers, ranking       `pair`, `outliers`,         -
                                              `candidates`
 ===========================================  ==========================  =========================
