@@ -286,7 +286,11 @@ def _fit(
     n_rejected: int,
     warnings: list[str],
 ) -> Fit:
-    rms = rms_px(residuals * np.sqrt(weights / weights.mean())[:, None])
+    # an answer that is not to be trusted may leave spots where none can be seen
+    seen = np.isfinite(residuals).all(axis=1)
+    counted = weights[seen]
+    share = counted / counted.mean() if counted.any() else counted
+    rms = rms_px(residuals[seen] * np.sqrt(share)[:, None])
     if solution.troubles:
         status = "not to be trusted: " + "; ".join(solution.troubles)
     else:

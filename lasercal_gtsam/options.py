@@ -12,6 +12,8 @@ from lasercal_gtsam.errors import DataError
 
 Robust = Literal["auto", "none", "huber", "cauchy", "geman-mcclure", "gnc-tls"]
 HAND_NOISE_NAMES = ("hand_sigma_m", "hand_sigma_rad")
+# squares of sigmas beyond these over- or underflow, and no robot or camera has them
+SMALLEST_SIGMA, LARGEST_SIGMA = 1e-12, 1e6
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2")
 
 
@@ -82,7 +84,8 @@ class CalibrationOptions:
             allowed = ", ".join(get_args(Robust))
             problems.append(f"options.robust: expected one of {allowed}, got {self.robust!r}")
         problems += _estimate_problems(self)
-        if isinstance(self.fixed, str) or not all(isinstance(x, str) for x in self.fixed):
+        named = isinstance(self.fixed, tuple | list) and all(isinstance(x, str) for x in self.fixed)
+        if not named:
             problems.append(f"options.fixed: expected a tuple of names, got {self.fixed!r}")
         problems += [
             f"options.{name}: expected a dict, got {getattr(self, name)!r}"
@@ -105,9 +108,18 @@ class CalibrationOptions:
 
 def _number_problems(options: CalibrationOptions) -> list[str]:
     wanted = {
-        "sigma_px": (options.sigma_px is None or _finite(options.sigma_px) > 0, "a number > 0"),
-        "hand_sigma_m": (_finite(options.hand_sigma_m) >= 0, "a number >= 0 (metres)"),
-        "hand_sigma_rad": (_finite(options.hand_sigma_rad) >= 0, "a number >= 0 (radians)"),
+        "sigma_px": (
+            options.sigma_px is None or _is_sigma(options.sigma_px),
+            f"a number of pixels from {SMALLEST_SIGMA:g} to {LARGEST_SIGMA:g}",
+        ),
+        "hand_sigma_m": (
+            options.hand_sigma_m == 0 or _is_sigma(options.hand_sigma_m),
+            f"0 or metres from {SMALLEST_SIGMA:g} to {LARGEST_SIGMA:g}",
+        ),
+        "hand_sigma_rad": (
+            options.hand_sigma_rad == 0 or _is_sigma(options.hand_sigma_rad),
+            f"0 or radians from {SMALLEST_SIGMA:g} to {LARGEST_SIGMA:g}",
+        ),
         "max_iterations": (
             isinstance(options.max_iterations, int) and options.max_iterations >= 1,
             "an integer >= 1",
@@ -133,6 +145,10 @@ def _estimate_problems(options: CalibrationOptions) -> list[str]:
         for name in wanted
         if getattr(options, name) != 0
     ]
+
+
+def _is_sigma(value: Any) -> bool:
+    return SMALLEST_SIGMA <= _finite(value) <= LARGEST_SIGMA
 
 
 def _finite(value: Any) -> float:

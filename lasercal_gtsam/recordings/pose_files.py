@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.io.capture_rows import LARGEST_NUMBER
 from lasercal_gtsam.io.files import read_text
 from lasercal_gtsam.io.wording import at_most
 from lasercal_gtsam.recordings.motion import Motion, QuaternionOrder, chain, pose_series
@@ -93,6 +94,9 @@ def _line(cells: list[str], layout: _Format) -> tuple[int, list[float]] | str:
     if stamp is None:
         return f"the stamp {cells[0]!r} is not in {'seconds' if layout.unit == 's' else 'whole ns'}"
     try:
-        return stamp, [float(cell) for cell in cells[1:8]]
+        numbers = [float(cell) for cell in cells[1:8]]
     except ValueError:
         return f"{', '.join(cells[1:8])} are not all numbers"
+    if not all(abs(number) <= LARGEST_NUMBER for number in numbers):  # NaN is not either
+        return f"{', '.join(cells[1:8])}: numbers that no robot has"
+    return stamp, numbers

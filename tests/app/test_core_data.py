@@ -232,7 +232,7 @@ def test_observations_say_what_is_wrong_and_where(changes, words):
         ({"distortion": "k1"}, ["options.distortion", "('k1',)"]),
         ({"distortion": "some"}, ["options.distortion", "'some'"]),
         ({"distortion": ("k1", "k3")}, ["options.distortion", "k3"]),
-        ({"sigma_px": 0.0}, ["options.sigma_px", "> 0"]),
+        ({"sigma_px": 0.0}, ["options.sigma_px", "from 1e-12"]),
         ({"sigma_px": -1.0}, ["options.sigma_px"]),
         ({"sigma_px": "1"}, ["options.sigma_px"]),
         ({"hand_sigma_m": -1e-3}, ["options.hand_sigma_m"]),

@@ -311,11 +311,11 @@ def test_names_are_in_natural_order():
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"sigma_px": 0}, r"options\.sigma_px: expected a number > 0, got 0"),
+        ({"sigma_px": 0}, r"options\.sigma_px: expected a number of pixels from 1e-12 to 1e\+06, got 0"),
         ({"sigma_px": "one"}, r"options\.sigma_px: .*got 'one'"),
         ({"sigma_px": np.inf}, r"options\.sigma_px"),
-        ({"hand_sigma_m": -1e-3}, r"options\.hand_sigma_m: expected a number >= 0 \(metres\)"),
-        ({"hand_sigma_rad": np.nan}, r"options\.hand_sigma_rad: .* \(radians\)"),
+        ({"hand_sigma_m": -1e-3}, r"options\.hand_sigma_m: expected 0 or metres from 1e-12"),
+        ({"hand_sigma_rad": np.nan}, r"options\.hand_sigma_rad: expected 0 or radians"),
         ({"max_iterations": 0}, r"options\.max_iterations: expected an integer >= 1"),
         ({"max_iterations": 2.5}, r"options\.max_iterations: expected an integer >= 1"),
         ({"robust": "maybe"}, r"options\.robust: expected one of auto, none"),
@@ -343,3 +343,17 @@ def test_options_keep_tuples():
     options = lc.CalibrationOptions(distortion=["k1"], fixed=["fu"])
     assert options.distortion == ("k1",)
     assert options.fixed == ("fu",)
+
+
+@pytest.mark.parametrize(
+    ("option", "value"),
+    [("sigma_px", 1e160), ("sigma_px", 1e-200), ("hand_sigma_m", 1e160), ("hand_sigma_rad", 1e-90)],
+)
+def test_sigmas_whose_squares_are_no_numbers_are_refused(option, value):
+    with pytest.raises(lc.DataError, match=rf"options\.{option}: expected .* from 1e-12 to 1e\+06"):
+        lc.CalibrationOptions(**{option: value})
+
+
+def test_fixed_takes_names_only():
+    with pytest.raises(lc.DataError, match=r"options\.fixed: expected a tuple of names, got 3"):
+        lc.CalibrationOptions(fixed=3)

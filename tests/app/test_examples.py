@@ -140,7 +140,7 @@ def test_6_hand_over_writes_what_it_says(out):
         assert name in text
         assert (out / name).stat().st_size > 100
     assert float(re.search(r"error (\S+) at the estimate", text)[1]) < 1e-6
-    assert (out / "report.html").read_text().startswith("<!doctype html>")
+    assert (out / "report.html").read_text().startswith("<!DOCTYPE html>")
 
 
 def test_the_start_from_drawings_leads_to_the_same_answer(capsys, tmp_path):

@@ -203,3 +203,11 @@ def test_pictures_in_order_must_be_as_many_as_poses_and_in_a_clear_order(tmp_pat
         open_folder(tmp_path, naming="order", pose_stamps=np.array([1, 2]))
     with pytest.raises(DataError, match=r"whether a10\.png or a2\.png comes first"):
         open_folder(tmp_path, naming="order", pose_stamps=np.array([1, 2, 3]))
+
+
+@pytest.mark.parametrize("number", ["1e300", "nan", "inf"])
+def test_numbers_that_no_robot_has_are_refused(tmp_path, number):
+    path = tmp_path / "poses.txt"
+    path.write_text(f"1.0 {number} 0 0 0 0 0 1\n2.0 0 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"poses\.txt:1: .*numbers that no robot has"):
+        read_pose_file(path, "tum", "T_base_hand")
