@@ -66,7 +66,9 @@ class Groups:
         xy, t, rows = self.xy[row, order], self.t[row, order], self.rows[row, order]
         there = np.take_along_axis(kept, order, axis=1)
         every = np.arange(len(self))
-        packed = Groups(self.R, self.plane, xy, t, there.astype(np.float64), np.where(there, rows, -1))
+        packed = Groups(
+            self.R, self.plane, xy, t, there.astype(np.float64), np.where(there, rows, -1)
+        )
         return packed.subset(every)
 
     @property
