@@ -299,11 +299,6 @@ def test_no_preset_is_flagged(preset, seed):
     result = lc.calibrate(made.observations, options=lc.CalibrationOptions(known=made.known))
     assert result.fit.converged
     assert [w.words for w in weaknesses(result) if not w.distortion] == []
-    straight = lc.calibrate(
-        made.observations,
-        options=lc.CalibrationOptions(known=made.known, distortion="none", robust="none"),
-    )
-    assert not straight.observability.weak
 
 
 def test_every_case_is_in_the_table():
