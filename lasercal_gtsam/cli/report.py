@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lasercal_gtsam.cli.console import progress, warn
+from lasercal_gtsam.cli.console import json_option, print_json, progress, warn
 from lasercal_gtsam.cli.outputs import check_target, check_writable
 from lasercal_gtsam.errors import DataError
 
@@ -35,8 +35,7 @@ _PAGE = b"<!doctype html"
     help=f"Where the page goes.  [default: {REPORT_FILE} beside the calibration]",
 )
 @click.option(
-    "--json",
-    "document",
+    "--document",
     metavar="FILE",
     type=click.Path(path_type=Path),
     help="Also write what the page shows as one JSON document.",
@@ -55,12 +54,14 @@ _PAGE = b"<!doctype html"
     help="Where the 95 % intervals come from: sigma, even about the answer; likelihood, right also "
     "where the problem bends (few spots, all distortion terms), some tenths of a second a row.",
 )
+@json_option
 def report(
     calibration: Path,
     output: Path | None,
     document: Path | None,
     capture: Path | None,
     intervals: str,
+    as_json: bool,
 ) -> int:
     """Write the report of CALIBRATION (calibration.json): one HTML file, to be read anywhere.
 
@@ -79,7 +80,10 @@ def report(
     found = _capture(capture, calibration.parent, origin)
     account = None if found is None else _account(found, loaded)
     ends = _by_likelihood(loaded) if intervals == "likelihood" else None
-    write(loaded, target, origin, found, account, document, ends)
+    made = write(loaded, target, origin, found, account, document, ends)
+    if as_json:
+        print_json(made)
+        return 0
     click.echo(f"Saved {target}." if document is None else f"Saved {target} and {document}.")
     return 0
 
@@ -92,11 +96,11 @@ def write(
     account: SpotAccount | None,
     document: Path | None = None,
     intervals: Intervals | None = None,
-) -> None:
-    """Write the page, and the document where that is wanted."""
+) -> dict[str, Any]:
+    """Write the page, and the document where that is wanted; returns the document."""
     from lasercal_gtsam.report.file import report as save
 
-    save(
+    return save(
         calibration,
         target,
         document=document,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.io.files import write_text
@@ -27,7 +27,7 @@ def report(
     capture: Capture | None = None,
     account: SpotAccount | None = None,
     intervals: Intervals | None = None,
-) -> None:
+) -> dict[str, Any]:
     """Write the uncertainty report, one HTML file that needs no network.
 
     Parameters
@@ -39,6 +39,11 @@ def report(
     capture, account : what it was made from, and what became of the capture's rows: for pictures of
         the spots that were left out
     intervals : 95 % intervals of the rows (`lasercal_gtsam.intervals`); None: those by sigma
+
+    Returns
+    -------
+    dict
+        What the page shows, as in the JSON document.
 
     Raises
     ------
@@ -52,3 +57,4 @@ def report(
     if document is not None:
         write_text(document, to_json(made) + "\n")
     write_text(path, page)
+    return made

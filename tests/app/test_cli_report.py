@@ -42,9 +42,18 @@ def folder(cell, tmp_path):
 
 def document_of(lasercal, calibration, *more):
     path = calibration.parent / "document.json"
-    outcome = lasercal("report", calibration, "--json", path, *more)
+    outcome = lasercal("report", calibration, "--document", path, *more)
     assert outcome.status == 0, outcome.err
     return json.loads(path.read_text()), outcome
+
+
+def test_json_prints_what_the_page_shows(lasercal, folder):
+    assert lasercal("calibrate", folder).status == 0
+    calibration = folder / "calibration.json"
+    document, _ = document_of(lasercal, calibration)
+    printed = lasercal.json("report", calibration)
+    assert printed.keys() == document.keys()
+    assert printed["parameters"] == document["parameters"]
 
 
 def test_calibrate_writes_the_report_beside_its_result(lasercal, folder):
@@ -112,7 +121,7 @@ def test_nothing_that_is_not_ours_is_overwritten(lasercal, folder):
     outcome = lasercal("report", calibration, "-o", calibration)
     assert outcome.status == 1
     assert "not a page" in outcome.err
-    outcome = lasercal("report", calibration, "--json", calibration)
+    outcome = lasercal("report", calibration, "--document", calibration)
     assert outcome.status == 1
     assert "not a lasercal report" in outcome.err
     outcome = lasercal("calibrate", folder, "--report", folder / "poses.csv")
