@@ -17,6 +17,7 @@ _EXPORTS = {
     "CalibrationOptions": "options",
     "Camera": "cell",
     "Cell": "cell",
+    "Comparison": "comparison",
     "DataError": "errors",
     "DegenerateError": "errors",
     "DetectionError": "errors",
@@ -32,6 +33,7 @@ _EXPORTS = {
     "Verdict": "opinions",
     "adjusted_hand_poses": "hand_noise.poses",
     "calibrate": "api",
+    "compare": "comparison",
     "export": "formats.export",
     "hand_pose_graph": "hand_noise.explicit",
     "intervals": "confidence",
@@ -56,6 +58,7 @@ __all__ = [
     "CalibrationOptions",
     "Camera",
     "Cell",
+    "Comparison",
     "DataError",
     "DegenerateError",
     "DetectionError",
@@ -73,6 +76,7 @@ __all__ = [
     "adjusted_hand_poses",
     "calibrate",
     "check_sigma",
+    "compare",
     "export",
     "hand_pose_graph",
     "intervals",
@@ -93,6 +97,7 @@ if TYPE_CHECKING:
     from lasercal_gtsam.api import calibrate
     from lasercal_gtsam.calibration import Calibration, Parameter
     from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics, Plane
+    from lasercal_gtsam.comparison import Comparison, compare
     from lasercal_gtsam.confidence import intervals
     from lasercal_gtsam.errors import (
         DataError,

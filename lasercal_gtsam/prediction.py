@@ -83,7 +83,7 @@ def spot_jacobian(
     J_point = point_jacobian(points, cell.cameras[camera])
     J = np.concatenate(
         [
-            _by_camera(points, cell.cameras[camera]),
+            pixel_by_camera(points, cell.cameras[camera]),
             J_point @ _by_beam(T, cell.lasers[laser], cell.planes[plane]),
             J_point @ _by_plane(points, T, cell.lasers[laser], cell.planes[plane]),
         ],
@@ -133,7 +133,7 @@ def located_jacobian(cell: Cell, uv: Array, plane: str, camera: str) -> tuple[Ar
     M[:, :2] = point_jacobian(points, seen)
     M[:, 2] = part.normal_base
     rhs = np.zeros((len(uv), 3, len(CAMERA_TANGENT) + len(PLANE_TANGENT)))
-    rhs[:, :2, : len(CAMERA_TANGENT)] = -_by_camera(points, seen)
+    rhs[:, :2, : len(CAMERA_TANGENT)] = -pixel_by_camera(points, seen)
     rhs[:, 2, len(CAMERA_TANGENT) : -1] = -points @ basis_of(part.normal_base)
     rhs[:, 2, -1] = 1.0
     seen_at = np.isfinite(points).all(axis=1)
@@ -157,7 +157,7 @@ def _propagate(J: Array, covariance: Array) -> Array:
     return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
 
 
-def _by_camera(points: Array, camera: Camera) -> Array:
+def pixel_by_camera(points: Array, camera: Camera) -> Array:
     """Derivative of the pixels of fixed base points by `CAMERA_TANGENT`, (N, 2, 15)."""
     R, i = camera.T_base_camera[:3, :3], camera.intrinsics
     p = (points - camera.T_base_camera[:3, 3]) @ R

@@ -2,52 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass
 
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.errors import DataError, SolveError
 from lasercal_gtsam.io.capture import Capture
-from lasercal_gtsam.io.files import read_json, sha256_of
+from lasercal_gtsam.io.origin import Origin as Origin
 from lasercal_gtsam.io.spot_account import SpotAccount
 from lasercal_gtsam.opinions.bench import Bench, lay_out
 from lasercal_gtsam.opinions.split import fit_halves
 from lasercal_gtsam.opinions.verdict import Verdict, judge
-
-
-@dataclass(frozen=True)
-class Origin:
-    """Where a calibration came from, as far as it is known.
-
-    Attributes
-    ----------
-    file, sha256 : name and digest of ``calibration.json``; "" where it is on no disk
-    created, version : when and with which version it was made (ISO time); "" where not known
-    files : file name to SHA-256 of what the spots were read from
-    """
-
-    file: str = ""
-    sha256: str = ""
-    created: str = ""
-    version: str = ""
-    files: Mapping[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of_file(cls, path: str | Path) -> Origin:
-        """Read it from a ``calibration.json``; DataError where that cannot be read."""
-        data = read_json(Path(path))
-        said: Any = data.get("provenance") if isinstance(data, dict) else None
-        said = said if isinstance(said, dict) else {}
-        files = said.get("files")
-        return cls(
-            file=Path(path).name,
-            sha256=sha256_of(path),
-            created=str(said.get("created", "")),
-            version=str(said.get("version", "")),
-            files={str(k): str(v) for k, v in files.items()} if isinstance(files, dict) else {},
-        )
 
 
 @dataclass(frozen=True, eq=False)
