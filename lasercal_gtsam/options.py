@@ -153,8 +153,10 @@ def _is_sigma(value: Any) -> bool:
 
 def _finite(value: Any) -> float:
     """The number, or NaN where it is not one (no comparison is true of NaN)."""
-    good = isinstance(value, Real) and math.isfinite(value)
-    return float(value) if good else math.nan
+    try:
+        return float(value) if isinstance(value, Real) and math.isfinite(value) else math.nan
+    except OverflowError:  # an integer of hundreds of digits
+        return math.nan
 
 
 def _distortion_problems(wanted: Any) -> list[str]:

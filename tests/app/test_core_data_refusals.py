@@ -311,7 +311,10 @@ def test_names_are_in_natural_order():
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"sigma_px": 0}, r"options\.sigma_px: expected a number of pixels from 1e-12 to 1e\+06, got 0"),
+        (
+            {"sigma_px": 0},
+            r"options\.sigma_px: expected a number of pixels from 1e-12 to 1e\+06, got 0",
+        ),
         ({"sigma_px": "one"}, r"options\.sigma_px: .*got 'one'"),
         ({"sigma_px": np.inf}, r"options\.sigma_px"),
         ({"hand_sigma_m": -1e-3}, r"options\.hand_sigma_m: expected 0 or metres from 1e-12"),
@@ -347,7 +350,13 @@ def test_options_keep_tuples():
 
 @pytest.mark.parametrize(
     ("option", "value"),
-    [("sigma_px", 1e160), ("sigma_px", 1e-200), ("hand_sigma_m", 1e160), ("hand_sigma_rad", 1e-90)],
+    [
+        ("sigma_px", 10**400),
+        ("sigma_px", 1e160),
+        ("sigma_px", 1e-200),
+        ("hand_sigma_m", 1e160),
+        ("hand_sigma_rad", 1e-90),
+    ],
 )
 def test_sigmas_whose_squares_are_no_numbers_are_refused(option, value):
     with pytest.raises(lc.DataError, match=rf"options\.{option}: expected .* from 1e-12 to 1e\+06"):
