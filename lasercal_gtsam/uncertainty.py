@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from lasercal_factors.batch import Loss
+from lasercal_factors.batch import Loss, SpotBatch
 
 from lasercal_gtsam.calibration import Parameter, WeakDirection, measured
 from lasercal_gtsam.cell import Cell
@@ -129,15 +129,28 @@ def spot_leverages(problem: CellGraph, root: Array) -> Array:
     problem : its chart about the solution
     root : (n, m) square root of the covariance of all coordinates, spots at their stated sigmas
     """
-    batch = problem.batch
-    rows = batch.rows(state_from_cell(problem.start)) / problem.scale
-    rows[..., 21] *= -1.0  # the kernels' offset of a plane is minus its distance
+    rows = problem.batch.rows(state_from_cell(problem.start)) / problem.scale
     if problem.loss.name != "none":
         m = np.einsum("ni,ni->n", rows[..., -1], rows[..., -1])
         rows *= np.sqrt(loss_weights(problem.loss, m))[:, None, None]
+    return hat_diagonal(problem.batch, rows, root, problem.start)
+
+
+def hat_diagonal(batch: SpotBatch, rows: Array, root: Array, cell: Cell) -> Array:
+    """Diagonal of the hat matrix, summed over the two rows of each spot, (N,).
+
+    Parameters
+    ----------
+    batch : spots, whose indices are those of the cell's parts
+    rows : (N, 2, 23) as `SpotBatch.rows` gives them at the cell, weighted as the spots count
+    root : (n, m) square root of the covariance of all tangent coordinates, in the rows' units
+    cell : where it is linearised
+    """
     sizes = (len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT))
-    lasers = sizes[0] * len(problem.start.cameras)
-    planes = lasers + sizes[1] * len(problem.start.lasers)
+    lasers = sizes[0] * len(cell.cameras)
+    planes = lasers + sizes[1] * len(cell.lasers)
+    root = root.copy()
+    root[planes + 2 :: sizes[2]] *= -1.0  # the kernels' offset of a plane is minus its distance
     parts = np.zeros((len(batch), 2, root.shape[1]))
     for c, l, p, first, last in batch.spots.blocks:  # noqa: E741
         at = np.concatenate(

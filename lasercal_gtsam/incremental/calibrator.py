@@ -508,6 +508,7 @@ class IncrementalCalibrator:
                 older=older + first,
                 words=words,
                 troubles=tuple(troubles),
+                fade=settings.weighing.fade,
             )
             spots = store.observations(begin, end)
             return calibration_of(estimate, spots, begin, account, settings.unit)

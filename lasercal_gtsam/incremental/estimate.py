@@ -78,17 +78,27 @@ class Estimate:
         Zero for constants, NaN for what is not determined yet and where there is no scale; all NaN
         where some combination is not determined.
         """
-        fixed = self.fixed | self.open
-        free = np.flatnonzero(~fixed)
-        R = self.R[np.ix_(free, free)]
-        root = np.linalg.inv(R) if np.all(np.diag(R) > 0) else np.full_like(R, np.nan)
-        E = expansion(self.chart.aspects, ~fixed)
-        J = cell_tangent_map(self.chart, self.z, self.state) @ E @ root
-        covariance = np.asarray(self.sigma0**2 * J @ J.T)
-        constant = ~np.any(E != 0, axis=1) & ~self.open
+        root = self.root()
+        covariance = np.asarray(self.sigma0**2 * root @ root.T)
+        constant = ~np.any(self._expansion != 0, axis=1) & ~self.open
         covariance[constant], covariance[:, constant] = 0.0, 0.0
         covariance[self.open], covariance[:, self.open] = np.nan, np.nan
         return covariance
+
+    def root(self) -> Array:
+        """(n, m) square root of the covariance that the a-priori sigmas give, at `cell`.
+
+        In tangent coordinates; NaN where some combination is not determined.
+        """
+        free = np.flatnonzero(~(self.fixed | self.open))
+        R = self.R[np.ix_(free, free)]
+        root = np.linalg.inv(R) if np.all(np.diag(R) > 0) else np.full_like(R, np.nan)
+        return cell_tangent_map(self.chart, self.z, self.state) @ self._expansion @ root
+
+    @property
+    def _expansion(self) -> Array:
+        """(n, m): all coordinates from those that are estimated."""
+        return expansion(self.chart.aspects, ~(self.fixed | self.open))
 
     @property
     def _aspect(self) -> dict[str, float]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from lasercal_factors.batch import SpotBatch
 
 from lasercal_gtsam.calibration import (
     Calibration,
@@ -28,9 +30,16 @@ from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import project
 from lasercal_gtsam.report_map import tangent_labels
 from lasercal_gtsam.solve import fold_warnings
-from lasercal_gtsam.uncertainty import Uncertainty, report_notes, table_parameters
+from lasercal_gtsam.uncertainty import (
+    Uncertainty,
+    hat_diagonal,
+    report_notes,
+    table_parameters,
+)
 
 _HAND_ROUNDS = 3
+# spots that are looked at together, so that memory stays small however many there are
+_TOGETHER = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -47,6 +56,7 @@ class Account:
     older : spots that live on in the prior only
     words : what is held
     troubles : sentences
+    fade : factor on a spot's information for each spot that came after it
     """
 
     initial: Cell
@@ -57,6 +67,22 @@ class Account:
     older: int
     words: tuple[str, ...]
     troubles: tuple[str, ...]
+    fade: float = 1.0
+
+
+class _Compared(NamedTuple):
+    """Stored spots against the estimate.
+
+    Attributes
+    ----------
+    residual_px : (N, 2) predicted minus seen, NaN where a part is not known
+    length : (N,) whitened (a-priori sigmas), infinite where no spot can be
+    leverage : (N,) of each, as if it was used (`SpotResult`)
+    """
+
+    residual_px: Array
+    length: Array
+    leverage: Array
 
 
 def uncertainty_of(estimate: Estimate, unit: float = 1.0) -> Uncertainty:
@@ -86,7 +112,7 @@ def calibration_of(
     """
     cell = estimate.cell
     uncertainty = uncertainty_of(estimate, unit)
-    residuals, lengths = _residuals(cell, observations, account)
+    residuals, lengths, leverage = _compared(estimate, observations, account)
     rejected = np.array(
         [
             _reason(length / estimate.sigma0, account.limit / estimate.sigma0)
@@ -127,6 +153,7 @@ def calibration_of(
             residuals,
             used.astype(np.float64),
             tuple(rejected.tolist()),
+            np.where(used, leverage, 0.0),
         ),
         observability=Observability(
             svd.weak_directions(sigma=estimate.sigma0), account.words, tuple(notes)
@@ -135,28 +162,45 @@ def calibration_of(
     )
 
 
-def _residuals(cell: Cell, seen: Observations, account: Account) -> tuple[Array, Array]:
-    """Pixels (N, 2) and whitened lengths (N,) of spots whose parts are all known; else NaN."""
-    residuals, lengths = np.full((len(seen), 2), np.nan), np.full(len(seen), np.inf)
-    rows = np.flatnonzero(determined(seen, cell))
-    if not len(rows):
-        return residuals, lengths
-    spots, options = seen[rows], account.options
-    names = {k: getattr(spots, k).tolist() for k in ("plane", "camera", "laser")}
-    residuals[rows] = project(cell, spots.T_base_hand, **names) - spots.uv
+def _compared(estimate: Estimate, seen: Observations, account: Account) -> _Compared:
+    """Residuals and leverages of the spots whose parts are all known.
+
+    Leverages are those of the batch solution, with the running covariance. What older spots and
+    priors say is in that, so that stored spots have the less leverage beside them: their sum is
+    what of the unknowns they determine themselves. A spot that has faded has its share only.
+    """
+    cell, root = estimate.cell, estimate.root()
+    coordinates = {label: k for k, label in enumerate(tangent_labels(cell))}
+    count = len(seen)
+    out = _Compared(np.full((count, 2), np.nan), np.full(count, np.inf), np.full(count, np.nan))
+    known = np.flatnonzero(determined(seen, cell))
+    for begin in range(0, len(known), _TOGETHER):
+        rows = known[begin : begin + _TOGETHER]
+        spots = seen[rows]
+        names = {k: getattr(spots, k).tolist() for k in ("plane", "camera", "laser")}
+        out.residual_px[rows] = project(cell, spots.T_base_hand, **names) - spots.uv
+        part = cell.restricted(spots)
+        batch, state = _batch(spots, part, account), state_from_cell(part)
+        found = batch.whitened_lengths(state)
+        out.length[rows] = np.where(np.isnan(found), np.inf, found)
+        at = [coordinates[label] for label in tangent_labels(part)]
+        linear = batch.rows(state)
+        linear[~np.isfinite(found)] = 0.0
+        weights = account.fade ** (count - 1 - rows)
+        out.leverage[rows] = weights * hat_diagonal(batch, linear, root[at], part)
+    return out
+
+
+def _batch(spots: Observations, cell: Cell, account: Account) -> SpotBatch:
+    """Spots as they count: with the hand poses that are likeliest, where the hand is noisy."""
+    noise = HandNoise.of(account.options)
+    if not max(noise) > 0:
+        return make_batch(spots, account.sigma_px)
     cov = pixel_covariances(spots, account.sigma_px)
-    noise = HandNoise.of(options)
-    part = cell.restricted(spots)
-    if max(noise) > 0:
-        eta = np.zeros((len(spots), 6))
-        for _ in range(_HAND_ROUNDS):
-            eta = corrections(*linearized(spots, part, eta), cov, noise)
-        batch = corrected_batch(spots, cov, part, noise, eta)
-    else:
-        batch = make_batch(spots, account.sigma_px)
-    found = batch.whitened_lengths(state_from_cell(part))
-    lengths[rows] = np.where(np.isnan(found), np.inf, found)
-    return residuals, lengths
+    eta = np.zeros((len(spots), 6))
+    for _ in range(_HAND_ROUNDS):
+        eta = corrections(*linearized(spots, cell, eta), cov, noise)
+    return corrected_batch(spots, cov, cell, noise, eta)
 
 
 def _reason(length: float, limit: float) -> str:
