@@ -18,6 +18,7 @@ from lasercal_gtsam import __version__
 from lasercal_gtsam.cli.calibrate import calibrate
 from lasercal_gtsam.cli.check import check
 from lasercal_gtsam.cli.check_sigma import check_sigma
+from lasercal_gtsam.cli.compare import compare
 from lasercal_gtsam.cli.demo import demo
 from lasercal_gtsam.cli.detect import detect
 from lasercal_gtsam.cli.export import export
@@ -57,6 +58,7 @@ for _command in (
     check,
     check_sigma,
     judge,
+    compare,
     report,
     plot,
     import_recording,

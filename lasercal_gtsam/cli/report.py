@@ -126,9 +126,13 @@ def _by_likelihood(calibration: Calibration) -> Intervals:
 
 def report_target(output: Path | None, folder: Path) -> Path:
     """Where the page goes; `DataError` where it cannot, or where something else is."""
-    target = folder / REPORT_FILE if output is None else output
+    return page_target(folder / REPORT_FILE if output is None else output, REPORT_FILE)
+
+
+def page_target(target: Path, name: str) -> Path:
+    """The file, or one of that name where a folder was given; `DataError` as in `report_target`."""
     if target.is_dir():
-        target = target / REPORT_FILE
+        target = target / name
     check_writable(target)
     if target.exists() and not _is_page(target):
         raise DataError(

@@ -52,7 +52,7 @@ def compare(
         {name: part for name, part in cells[0].planes.items() if name in cells[1].planes},
     )
     errors = lay_together(a, b, tangent_labels(common))
-    found = differences(a, b, common)
+    found = differences(a, b, common, errors.cells)
     distance, unknowns, chance = (0.0, 0, float("nan"))
     if found:
         distance, unknowns, chance = distance_of(
@@ -69,7 +69,7 @@ def compare(
     rows = _rows(common, b.cell, errors) if found else ()
     findings = Findings(
         parts, rows, chance, on_planes, in_pictures, errors, inputs,
-        all(not np.any(one.value) for one in found), bool(found),
+        b.cell.restricted(common) == common, bool(found),
     )  # fmt: skip
     verdict, words, next_action = conclude(findings)
     return Comparison(
@@ -114,8 +114,10 @@ def _rows(common: Cell, other: Cell, errors: Together) -> tuple[RowChange, ...]:
     change = values[1] - values[0]
     turns = np.array([unit == "deg" for _, unit in names])
     change[turns] = (change[turns] + _TURN_DEG / 2) % _TURN_DEG - _TURN_DEG / 2
-    J_a = row_jacobian(common, charts, beam_frames(common))
-    J_b = row_jacobian(there, charts, beam_frames(there))
+    J_a, J_b = (
+        row_jacobian(cell, charts, beam_frames(cell))
+        for cell in (cell.restricted(common) for cell in errors.cells)
+    )
     with np.errstate(invalid="ignore"):  # gimbal lock
         sigma = np.linalg.norm(J_b @ errors.root_b - J_a @ errors.root_a, axis=1)
     if not errors.known:

@@ -63,9 +63,8 @@ def _pixel_map(
     uv, points = uv[met], points[met]
     difference = project_points(points, other) - uv
     columns = _columns(errors, [f"{camera}.{t}" for t in CAMERA_TANGENT])
-    expected = _spread(
-        pixel_by_camera(points, seen_by), pixel_by_camera(points, other), columns, errors
-    )
+    J_a, J_b = (pixel_by_camera(points, cell.cameras[camera]) for cell in errors.cells)
+    expected = _spread(J_a, J_b, columns, errors)
     border = hull(np.concatenate([_pixels(one, camera, plane) for one in (a, b)]))
     length = np.linalg.norm(difference, axis=1)
     both = np.isfinite(length)
@@ -125,8 +124,10 @@ def _plane_map(a: Calibration, b: Calibration, base: ErrorMap, errors: Together)
     nodes = np.stack(np.meshgrid(base.x_mm, base.y_mm), axis=-1).reshape(-1, 2)
     uv = project_points(base.axes.to_base(nodes), a.cell.cameras[base.camera])
     uv[~np.isfinite(base.error_mm).ravel()] = np.nan
-    here, J_a, _ = located_jacobian(a.cell, uv, base.plane, base.camera)
-    there, J_b, _ = located_jacobian(b.cell, uv, base.plane, base.camera)
+    here, there = (
+        spot_on_ray(one.cell, uv, plane=base.plane, camera=base.camera) for one in (a, b)
+    )
+    J_a, J_b = (located_jacobian(cell, uv, base.plane, base.camera)[1] for cell in errors.cells)
     names = [f"{base.camera}.{t}" for t in CAMERA_TANGENT]
     names += [f"plane {base.plane}.{t}" for t in PLANE_TANGENT]
     expected = MM_PER_M * _spread(J_a, J_b, _columns(errors, names), errors)

@@ -35,10 +35,13 @@ class Difference:
     J_b: Array
 
 
-def differences(a: Calibration, b: Calibration, common: Cell) -> list[Difference]:
+def differences(
+    a: Calibration, b: Calibration, common: Cell, at_cells: tuple[Cell, Cell]
+) -> list[Difference]:
     """Every part of ``common`` (A's cell, the parts that both have) in its coordinates.
 
-    The derivatives are by the tangent coordinates of ``common``, in their order.
+    The derivatives are by the tangent coordinates of ``common``, in their order, of either cell of
+    ``at_cells`` (`Together.cells`).
     """
     n_camera, n_beam, n_plane = len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT)
     n = n_camera * len(common.cameras) + n_beam * len(common.lasers) + n_plane * len(common.planes)
@@ -46,7 +49,7 @@ def differences(a: Calibration, b: Calibration, common: Cell) -> list[Difference
     at = 0
     for name in common.cameras:
         A, B = a.cell.cameras[name], b.cell.cameras[name]
-        J_a, J_b = _pose_jacobians(A.T_base_camera, B.T_base_camera)
+        J_a, J_b = _pose_jacobians(*(cell.cameras[name].T_base_camera for cell in at_cells))
         found.append(
             _placed("camera", name, _pose(A.T_base_camera, B.T_base_camera), J_a, J_b, at, n)
         )
@@ -54,21 +57,18 @@ def differences(a: Calibration, b: Calibration, common: Cell) -> list[Difference
         found.append(_placed("lens", name, change, np.eye(9), np.eye(9), at + 6, n))
         at += n_camera
     for name in common.lasers:
-        one, two = a.cell.lasers[name], b.cell.lasers[name]
-        frame = _frame_at_origin(one)
+        frame = _frame_at_origin(a.cell.lasers[name])
+        two = b.cell.lasers[name]
         value = frame.coordinates(two.direction_hand, two.point_hand)
-        found.append(
-            _placed(
-                "laser", name, value, _line_jacobian(one, frame), _line_jacobian(two, frame), at, n
-            )
-        )
+        J_a, J_b = (_line_jacobian(cell.lasers[name], frame) for cell in at_cells)
+        found.append(_placed("laser", name, value, J_a, J_b, at, n))
         at += n_beam
     for name in common.planes:
         p, q = a.cell.planes[name], b.cell.planes[name]
         middle = _middle(a, b, name)
-        here, J_a = _flat(p, p, middle)
-        there, J_b = _flat(q, p, middle)
-        found.append(_placed("plane", name, there - here, J_a, J_b, at, n))
+        value = _flat(q, p, middle)[0] - _flat(p, p, middle)[0]
+        J_a, J_b = (_flat(cell.planes[name], p, middle)[1] for cell in at_cells)
+        found.append(_placed("plane", name, value, J_a, J_b, at, n))
         at += n_plane
     return found
 

@@ -66,6 +66,11 @@ class PartChange:
     shift_sigma_mm: float
     held: tuple[str, ...] = ()
 
+    @property
+    def label(self) -> str:
+        """What it is, for a table."""
+        return f"{'lens of camera' if self.kind == 'lens' else self.kind} {self.name!r}"
+
 
 @dataclass(frozen=True, eq=False)
 class PixelMap(FrozenData):

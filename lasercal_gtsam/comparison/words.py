@@ -22,6 +22,8 @@ Verdict = Literal["same", "different", "identical", "unknown"]
 
 SURE = 0.01
 """Chance below which noise does not explain a difference."""
+# logarithm of a ratio of sigmas that is not worth a word
+_ALIKE = 0.1
 _ACTIONS = {
     "camera": "use B for this camera from now on, and look for what moved it: a loose mount, a "
     "bump, a tool change",
@@ -154,12 +156,20 @@ def _next(changed: list[PartChange], found: Findings) -> str:
 
 
 def _either(found: Findings) -> str:
+    sigmas = [np.linalg.norm(root, axis=1) for root in (found.errors.root_a, found.errors.root_b)]
+    free = (sigmas[0] > 0) & (sigmas[1] > 0)
+    ratio = float(np.median(sigmas[1][free] / sigmas[0][free])) if free.any() else 1.0
+    if abs(np.log(ratio)) < _ALIKE:
+        better = "Use either of them; their sigmas are alike"
+    else:
+        name, other = ("B", "A") if ratio < 1 else ("A", "B")
+        better = (
+            f"Use {name}: its sigmas are {min(ratio, 1 / ratio):.2g} times those of {other} in the "
+            "median"
+        )
     if found.errors.shared_spots:
-        return "Use the one with more spots: it holds what the other knows."
-    return (
-        "Use the one with the smaller sigmas; better still calibrate the spots of both together "
-        "('lasercal update')."
-    )
+        return f"{better}."
+    return f"{better}. The spots of both together would do better still ('lasercal update')."
 
 
 def basis_words(errors: Together, inputs: InputsChange) -> str:

@@ -22,6 +22,11 @@ SECTIONS = (
     "correlation", "weak", "scene", "model_error", "conventions", "inputs",
 )  # fmt: skip
 """Sections in the order of the page: a key of the document, a template and an anchor each."""
+COMPARISON = (
+    ("parts", "Parts"), ("rows", "Rows of the table"), ("planes", "Millimetres on the planes"),
+    ("pixels", "Pixels in the picture"), ("inputs", "Inputs"),
+)  # fmt: skip
+"""Sections of a comparison's page: anchors and headings."""
 FEW = 12
 """Rows of a table beyond which the rest is folded away."""
 _TIGHT = "\N{NO-BREAK SPACE}"
@@ -54,6 +59,15 @@ def render(document: Mapping[str, Any]) -> str:
     )
 
 
+def render_comparison(document: Mapping[str, Any]) -> str:
+    """One HTML file of a comparison (`lasercal_gtsam.report.comparison`); no script runs in it."""
+    return (
+        _environment()
+        .get_template("comparison.html.j2")
+        .render(doc=document, contents=COMPARISON, css=Markup(_asset("report.css")), few=FEW)
+    )
+
+
 @cache
 def _environment() -> Environment:
     environment = Environment(
@@ -68,6 +82,7 @@ def _environment() -> Environment:
         residual_histogram=pictures.residual_histogram,
         image_coverage=pictures.image_coverage,
         plane_coverage=planes.plane_coverage,
+        difference_map=planes.difference_map,
         error_map=planes.error_map,
         split_map=planes.split_map,
         correlation_matrix=matrices.correlation_matrix,

@@ -38,7 +38,10 @@ _DOT = 2.4
 
 
 def residual_vectors(image: Mapping[str, Any]) -> Markup:
-    """Arrows from each spot seen towards the spot predicted, with the scale that they are in."""
+    """Arrows from each spot seen towards the spot predicted, with the scale that they are in.
+
+    With a ``title`` of its own the picture may show other arrows.
+    """
     frame = picture_frame(image["image_size"], top=44.0)
     spots, planes = image["spots"], image["planes"]
     scale = image["magnification"] * frame.scale
@@ -91,7 +94,7 @@ def residual_vectors(image: Mapping[str, Any]) -> Markup:
         WIDTH,
         frame.bottom + FOOT,
         parts,
-        title=f"Residual vectors, camera {image['camera']}",
+        title=image.get("title", f"Residual vectors, camera {image['camera']}"),
         description=image["alt"],
     )
 

@@ -78,6 +78,15 @@ def split_map(chart: Mapping[str, Any], index: int) -> Markup:
     )  # fmt: skip
 
 
+def difference_map(chart: Mapping[str, Any], index: int) -> Markup:
+    """How far apart two calibrations locate the same pixel on a plane, mm."""
+    return _map(
+        chart, chart["difference_mm"], chart["contours"], "Distance (mm)",
+        f"Distance on plane {chart['plane']}, camera {chart['camera']}", chart["alt"],
+        f"difference-view-{index}",
+    )  # fmt: skip
+
+
 def plane_frame(outlines: Sequence[Array], top: float = 12.0, margin: float = _MARGIN) -> Frame:
     """A frame with equal scales that holds these points (n, 2) in mm, with a margin around."""
     points = np.concatenate([np.asarray(o, dtype=float).reshape(-1, 2) for o in outlines])
