@@ -259,6 +259,7 @@ class IncrementalCalibrator:
 
     def _begin(self, found: Calibration, words: str) -> None:
         self._settings = self._settings.informed_by(found)
+        self._store.assume(self._settings.sigma_px)
         self._run(begun(self._store, found, self._settings), found)
         self._missing, self._next_audit = (), int(_AUDIT_GROWTH * len(self._store))
         self._note("started", words)

@@ -62,6 +62,12 @@ class SpotStore:
             done += count
         return range(start, self.end)
 
+    def assume(self, sigma_px: float) -> None:
+        """Let all spots without a covariance of their own count with this sigma from now on."""
+        stated = np.array([path[3] for path in self.paths], dtype=np.bool_)
+        for _, (records, path, _) in self.slices(self.first, self.end):
+            records[~stated[path], 2:5] = (1.0 / sigma_px, 0.0, 1.0 / sigma_px)
+
     def slices(self, begin: int, end: int) -> Iterator[tuple[int, Slice]]:
         """Views of the spots begin ... end-1, piece by piece: first number, then the arrays."""
         while begin < end:

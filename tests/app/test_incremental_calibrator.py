@@ -66,6 +66,19 @@ def test_equals_the_batch_solution(preset, noise, options):
     agrees(calibrator, spots, options)
 
 
+def test_a_pixel_sigma_found_again_counts_for_the_spots_before_it_too():
+    _, spots = stream(noise=HAND)
+    options = lc.CalibrationOptions(distortion="none", **HAND_STATED)
+    calibrator = IncrementalCalibrator(options=options)
+    calibrator.add(spots[:60])
+    feed(calibrator, spots[60:], step=20)
+    found = [e.words for e in calibrator.events if "their noise is" in e.words]
+    assert len(found) > 2
+    sigma_px = float(found[-1].split()[-2])
+    stated = batch_of(spots, calibrator.add(spots[:0]), replace(options, sigma_px=sigma_px))
+    assert sigmas_between(calibrator.cell, stated) < 0.01
+
+
 def test_agrees_at_every_update_from_the_start_on():
     _, spots = stream(groups=5)
     calibrator = IncrementalCalibrator(options=PLAIN)
