@@ -413,6 +413,12 @@ class CalibrationModel(CellModel):
             yield f"covariance.labels: expected those of the cell's parts, got {found}"
         if [spot.id for spot in self.spots] != observations.id.tolist():
             yield "spots, inputs.observations: expected the same ids in the same order"
+            return
+        used = np.array([spot.rejected is None for spot in self.spots], dtype=np.bool_)
+        for kind in ("camera", "laser", "plane"):
+            named = set(getattr(observations, kind)[used].tolist())
+            if lost := sorted(named - set(getattr(cell, f"{kind}s"))):
+                yield f"inputs.observations.{kind}: {lost[0]!r:.60} is used, but not in the cell"
 
     def _spots(self) -> SpotResults:
         return SpotResults(

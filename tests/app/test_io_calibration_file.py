@@ -53,7 +53,10 @@ def random_cell(rng: np.random.Generator, names: tuple[str, ...] = ("camera",)) 
             for name in names
         },
         lasers={"laser": Beam(rng.standard_normal(3), rng.standard_normal(3))},
-        planes={name: Plane(rng.standard_normal(3), float(rng.standard_normal())) for name in "12"},
+        planes={
+            name: Plane(rng.standard_normal(3), float(rng.standard_normal()))
+            for name in ("1", "2", "table")
+        },
     )
 
 
@@ -354,6 +357,22 @@ def test_other_files(tmp_path: Path, text: str, expected: str) -> None:
     (problem,) = refusal(path)
     assert expected in problem
     assert problem.startswith(str(path))
+
+
+@pytest.mark.parametrize("kind", ["camera", "laser", "plane"])
+def test_spots_of_parts_that_the_cell_does_not_have(
+    saved: tuple[Path, dict[str, Any]], kind: str
+) -> None:
+    path, data = saved
+    names = data["inputs"]["observations"][kind]
+    names[:] = [names] if isinstance(names, str) else names
+    names[-1] = "elsewhere"
+    if kind == "camera":
+        data["inputs"]["observations"]["image_size"]["elsewhere"] = [640, 480]
+    path.write_text(json.dumps(data))
+    assert (
+        f"inputs.observations.{kind}: 'elsewhere' is used, but not in the cell" in refusal(path)[0]
+    )
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -20,7 +20,13 @@ from lasercal_gtsam.recordings.laser import OFF, ON, UNKNOWN, most_central, spot
 from lasercal_gtsam.recordings.motion import Motion, PoseSeries, chain, pose_series
 from lasercal_gtsam.recordings.plan import plan_capture
 from lasercal_gtsam.recordings.planes import OnePlane
-from lasercal_gtsam.recordings.stamps import as_stamps, duration_text, ns_from_seconds, seconds_text
+from lasercal_gtsam.recordings.stamps import (
+    as_stamps,
+    duration_text,
+    ns_from_integer,
+    ns_from_seconds,
+    seconds_text,
+)
 from lasercal_gtsam.recordings.stops import StillLimits, find_stops, stops_of_pictures
 from lasercal_gtsam.recordings.tree import TransformTree
 
@@ -422,3 +428,12 @@ def test_stamps_keep_every_digit():
         "10 min",
         "2.5 h",
     ]
+
+
+def test_stamps_that_no_clock_shows_are_none():
+    assert ns_from_integer(str(2**63 - 1)) == 2**63 - 1
+    assert ns_from_integer(str(2**63)) is None
+    assert ns_from_integer("9" * 5000) is None
+    assert ns_from_seconds("1e30") is None
+    assert ns_from_seconds("-1e400") is None
+    assert ns_from_seconds("9223372036.5") == 9223372036500000000
