@@ -44,6 +44,11 @@ def compare(
     -------
     Comparison
         Also where nothing can be said for want of sigmas or of common parts; it then says so.
+
+    Raises
+    ------
+    DataError
+        The beams of a laser are 90 deg or more apart in the hand: no difference of one laser.
     """
     cells = calibrated_cell(a), calibrated_cell(b)
     common = Cell(

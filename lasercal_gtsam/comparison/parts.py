@@ -9,8 +9,9 @@ from lasercal_factors.beam import BeamFrame
 
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.cell import INTRINSIC_NAMES, Beam, Cell, Plane
-from lasercal_gtsam.comparison.result import PartChange, PartKind
+from lasercal_gtsam.comparison.result import Motion, PartChange, PartKind
 from lasercal_gtsam.comparison.together import Together
+from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.figures.spots import places_of_spots, used_spots
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.opinions.chances import f_above, holm
@@ -18,6 +19,8 @@ from lasercal_gtsam.report_map import BEAM_TANGENT, CAMERA_TANGENT, PLANE_TANGEN
 from lasercal_gtsam.rotations import basis_of, rotation_log, skew
 from lasercal_gtsam.units import DEG_PER_RAD, MM_PER_M
 
+SURE = 0.01
+"""Chance below which noise does not explain a difference."""
 _TURNS = {"camera": 3, "lens": 0, "laser": 2, "plane": 2}
 """Turns come first of the coordinates of a difference, shifts after them."""
 # variance of a difference, in that of two separate estimates, below which it cannot differ by noise
@@ -42,6 +45,11 @@ def differences(
 
     The derivatives are by the tangent coordinates of ``common``, in their order, of either cell of
     ``at_cells`` (`Together.cells`).
+
+    Raises
+    ------
+    DataError
+        The beams of a laser are 90 deg or more apart.
     """
     n_camera, n_beam, n_plane = len(CAMERA_TANGENT), len(BEAM_TANGENT), len(PLANE_TANGENT)
     n = n_camera * len(common.cameras) + n_beam * len(common.lasers) + n_plane * len(common.planes)
@@ -59,6 +67,11 @@ def differences(
     for name in common.lasers:
         frame = _frame_at_origin(a.cell.lasers[name])
         two = b.cell.lasers[name]
+        if not float(two.direction_hand @ a.cell.lasers[name].direction_hand) > 0:
+            raise DataError(
+                f"laser {name!r}: its beam in B is 90 deg or more away from that in A: these are "
+                "two lasers, or the hand's frame is another one; give them different names"
+            )
         value = frame.coordinates(two.direction_hand, two.point_hand)
         J_a, J_b = (_line_jacobian(cell.lasers[name], frame) for cell in at_cells)
         found.append(_placed("laser", name, value, J_a, J_b, at, n))
@@ -189,15 +202,49 @@ def part_changes(found: list[Difference], errors: Together) -> tuple[PartChange,
     said = [i for i, part in enumerate(parts) if np.isfinite(part.chance)]
     for i, chance in zip(said, holm([parts[i].chance for i in said]), strict=True):
         parts[i] = replace(parts[i], corrected=chance)
+    changed = [i for i in said if parts[i].corrected < SURE]
+    for i, motion in _alone(found, changed, errors).items():
+        parts[i] = replace(parts[i], alone=motion)
     return tuple(parts)
+
+
+def _alone(found: list[Difference], changed: list[int], errors: Together) -> dict[int, Motion]:
+    """Motions of the parts that changed, given that the others did not: their conditional means.
+
+    Nothing where noise does not explain the others.
+    """
+    rest = [one for i, one in enumerate(found) if i not in changed]
+    moved = [i for i in changed if found[i].kind != "lens"]
+    if not (moved and rest):
+        return {}
+    value = np.concatenate([one.value for one in rest])
+    J_a, J_b = np.vstack([one.J_a for one in rest]), np.vstack([one.J_b for one in rest])
+    if not distance_of(value, J_a, J_b, errors)[2] >= SURE:
+        return {}
+    root = J_b @ errors.root_b - J_a @ errors.root_a
+    unit = np.linalg.norm(root, axis=1)
+    root, value = root[unit > 0] / unit[unit > 0, None], value[unit > 0] / unit[unit > 0]
+    motions = {}
+    for i in moved:
+        mine = found[i].J_b @ errors.root_b - found[i].J_a @ errors.root_a
+        gain = np.linalg.lstsq(root.T, mine.T)[0].T
+        motions[i] = _motion(found[i].kind, found[i].value - gain @ value, mine - gain @ root)
+    return motions
+
+
+def _motion(kind: PartKind, value: Array, root: Array) -> Motion:
+    turns = _TURNS[kind]
+    turn, turn_sigma = _size(value[:turns], root[:turns])
+    shift, shift_sigma = _size(value[turns:], root[turns:])
+    return Motion(
+        DEG_PER_RAD * turn, DEG_PER_RAD * turn_sigma, MM_PER_M * shift, MM_PER_M * shift_sigma
+    )
 
 
 def _change(one: Difference, errors: Together) -> PartChange:
     distance, unknowns, chance = distance_of(one.value, one.J_a, one.J_b, errors)
     root = one.J_b @ errors.root_b - one.J_a @ errors.root_a
-    turns = _TURNS[one.kind]
-    turn, turn_sigma = _size(one.value[:turns], root[:turns])
-    shift, shift_sigma = _size(one.value[turns:], root[turns:])
+    motion = _motion(one.kind, one.value, root)
     known = 1.0 if errors.known else np.nan
     lens = one.kind == "lens"
     still = ~(root.any(axis=1)) & (one.value != 0.0)
@@ -208,10 +255,10 @@ def _change(one: Difference, errors: Together) -> PartChange:
         unknowns=unknowns,
         chance=chance,
         corrected=np.nan,
-        turn_deg=np.nan if lens else DEG_PER_RAD * turn,
-        turn_sigma_deg=np.nan if lens else known * DEG_PER_RAD * turn_sigma,
-        shift_mm=np.nan if lens else MM_PER_M * shift,
-        shift_sigma_mm=np.nan if lens else known * MM_PER_M * shift_sigma,
+        turn_deg=np.nan if lens else motion.turn_deg,
+        turn_sigma_deg=np.nan if lens else known * motion.turn_sigma_deg,
+        shift_mm=np.nan if lens else motion.shift_mm,
+        shift_sigma_mm=np.nan if lens else known * motion.shift_sigma_mm,
         held=tuple(INTRINSIC_NAMES[i] for i in np.flatnonzero(still))
         if lens and errors.known
         else (),

@@ -37,6 +37,16 @@ class RowChange:
 
 
 @dataclass(frozen=True)
+class Motion:
+    """How far a part is turned and shifted, and one sigma of either along itself."""
+
+    turn_deg: float
+    turn_sigma_deg: float
+    shift_mm: float
+    shift_sigma_mm: float
+
+
+@dataclass(frozen=True)
 class PartChange:
     """How a part differs, all its coordinates together.
 
@@ -52,6 +62,9 @@ class PartChange:
         camera its centre; of a beam across itself where it passes the hand's origin; of a plane
         along its normal in the middle of its spots
     held : coordinates that both hold, at different values
+    alone : the motion if only the parts that changed have changed: much sharper, as errors of a
+        lens and of a pose make up for each other. Of parts that noise does not explain, where it
+        explains all others; else None
     """
 
     kind: PartKind
@@ -65,6 +78,7 @@ class PartChange:
     shift_mm: float
     shift_sigma_mm: float
     held: tuple[str, ...] = ()
+    alone: Motion | None = None
 
     @property
     def label(self) -> str:

@@ -9,8 +9,10 @@ import numpy as np
 
 from lasercal_gtsam.calibration import Calibration, measured
 from lasercal_gtsam.cell import Cell
+from lasercal_gtsam.comparison.parts import SURE
 from lasercal_gtsam.comparison.result import (
     InputsChange,
+    Motion,
     PartChange,
     PixelMap,
     PlaneMap,
@@ -20,8 +22,6 @@ from lasercal_gtsam.comparison.together import Together
 
 Verdict = Literal["same", "different", "identical", "unknown"]
 
-SURE = 0.01
-"""Chance below which noise does not explain a difference."""
 # logarithm of a ratio of sigmas that is not worth a word
 _ALIKE = 0.1
 _ACTIONS = {
@@ -95,10 +95,7 @@ def conclude(found: Findings) -> tuple[Verdict, str, str]:
 
 
 def _change_words(part: PartChange, found: Findings) -> str:
-    sizes = (
-        f"by {measured(part.shift_mm, part.shift_sigma_mm)} mm and "
-        f"{measured(part.turn_deg, part.turn_sigma_deg)} deg"
-    )
+    sizes = _sizes(part.alone) + " if nothing else changed" if part.alone else _sizes(part)
     z = f"{part.distance:.3g} sigma in {part.unknowns} unknowns"
     if part.kind == "camera":
         return f"camera {part.name!r} moved {sizes} ({z})"
@@ -114,6 +111,13 @@ def _change_words(part: PartChange, found: Findings) -> str:
     return (
         f"the lens of camera {part.name!r} changed ({z}; most of all {worst.name} by "
         f"{measured(worst.difference, worst.sigma)} {worst.unit})"
+    )
+
+
+def _sizes(moved: Motion | PartChange) -> str:
+    return (
+        f"by {measured(moved.shift_mm, moved.shift_sigma_mm)} mm and "
+        f"{measured(moved.turn_deg, moved.turn_sigma_deg)} deg"
     )
 
 

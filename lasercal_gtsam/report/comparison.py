@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -98,6 +99,9 @@ def _part(part: PartChange) -> dict[str, Any]:
         "shift_mm": number(part.shift_mm),
         "shift_sigma_mm": number(part.shift_sigma_mm),
         "held": list(part.held),
+        "alone": None
+        if part.alone is None
+        else {f.name: number(getattr(part.alone, f.name)) for f in fields(part.alone)},
     }
 
 

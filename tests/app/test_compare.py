@@ -100,6 +100,11 @@ def test_a_moved_camera_is_named_with_its_size() -> None:
     turn, shift = np.linalg.norm(cases.TURN_DEG), np.linalg.norm(cases.SHIFT_MM)
     assert abs(moved.turn_deg - turn) < 3 * moved.turn_sigma_deg
     assert abs(moved.shift_mm - shift) < 3 * moved.shift_sigma_mm
+    # with lens, beam and planes as they were the move is known much better
+    alone = moved.alone
+    assert alone.turn_sigma_deg < 0.3 * moved.turn_sigma_deg
+    assert abs(alone.turn_deg - turn) < 3 * alone.turn_sigma_deg
+    assert abs(alone.shift_mm - shift) < 3 * alone.shift_sigma_mm
     assert all(p.corrected > 0.01 for p in found.parts if p.kind != "camera")
     assert "what moved it" in found.next_action
 
@@ -185,6 +190,15 @@ def test_without_sigmas_or_common_parts_it_says_so() -> None:
 def test_without_spots_independence_is_not_claimed() -> None:
     found = lc.compare(figure_cases.without_spots(), cases.first())
     assert "cannot be verified" in found.basis
+
+
+def test_another_laser_of_the_same_name_is_refused() -> None:
+    b = cases.first()
+    beam = b.cell.lasers["laser"]
+    turned = lc.Beam(-beam.direction_hand, beam.point_hand)
+    other = replace(b, cell=replace(b.cell, lasers={"laser": turned}))
+    with pytest.raises(lc.DataError, match="90 deg or more away"):
+        lc.compare(cases.second(), other)
 
 
 def test_files_and_versions_that_differ() -> None:
