@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import sys
 import textwrap
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
@@ -12,6 +14,9 @@ from typing import Any
 import click
 
 Progress = Callable[[int, int], None]
+
+# between two lines about the progress where there is no terminal
+_LINE_SECONDS = 60.0
 
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as one JSON document on stdout."
@@ -51,10 +56,11 @@ def bullets(lines: Sequence[str]) -> list[str]:
 
 
 @contextmanager
-def progress(label: str) -> Iterator[Progress]:
+def progress(label: str, seldom: bool = False) -> Iterator[Progress]:
     """Give a function (done, total) that draws a progress bar on stderr if that is a terminal.
 
     The bar, and what draws it, come with the first call: often there is nothing to wait for.
+    Elsewhere (a log) it is silent, or with ``seldom`` writes a line a minute with the expected end.
     """
     with ExitStack() as stack:
         draw: Progress | None = None
@@ -65,11 +71,34 @@ def progress(label: str) -> Iterator[Progress]:
                 draw = _start_bar(label, stack)
             draw(done, total)
 
-        yield show if sys.stderr.isatty() else _be_silent
+        if sys.stderr.isatty():
+            yield show
+        else:
+            yield _seldom(label) if seldom else _be_silent
 
 
 def _be_silent(done: int, total: int) -> None:
     pass
+
+
+def _seldom(label: str, clock: Callable[[], float] = time.monotonic) -> Progress:
+    """Write ``Runs: 120 of 1200, 9 min left`` to stderr, at most once a minute."""
+    first: tuple[float, int] | None = None
+    last = clock()
+
+    def show(done: int, total: int) -> None:
+        nonlocal first, last
+        now = clock()
+        if first is None:
+            first = now, done
+        if now - last < _LINE_SECONDS or done >= total:
+            return
+        last = now
+        pace = (now - first[0]) / max(done - first[1], 1)
+        minutes = math.ceil(pace * (total - done) / 60.0)
+        click.echo(f"{label}: {done} of {total}, about {minutes} min left", err=True)
+
+    return show
 
 
 def _start_bar(label: str, stack: ExitStack) -> Progress:

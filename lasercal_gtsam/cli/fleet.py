@@ -55,7 +55,7 @@ def calibrate_many(
         "pages": [None if page is None else str(folder / page) for folder in folders],
     }
     work = Work("calibrate", partial(_run, settings), spec, len(captures))
-    with progress("Captures") as show:
+    with progress("Captures", seldom=True) as show:
         results = run_all(work, workers, chunk_seconds=0.0, progress=lambda p: show(p.done, p.runs))
     found = [{"capture": str(c), **r} for c, r in zip(captures, results.values, strict=True)]
     if as_json:

@@ -11,7 +11,7 @@ import click
 
 from lasercal_gtsam.cli.console import json_option, print_json
 from lasercal_gtsam.cli.texts import count
-from lasercal_gtsam.cli.values import Numbers, RotationName
+from lasercal_gtsam.cli.values import Names, Numbers, RotationName
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.units import DEG_PER_RAD, M_PER_MM, MM_PER_M, RAD_PER_DEG
 
@@ -56,6 +56,12 @@ if TYPE_CHECKING:
 )
 @click.option("--camera", metavar="NAME", help="Where the cell has several.")
 @click.option("--laser", metavar="NAME", help="Where the cell has several.")
+@click.option(
+    "--planes",
+    type=Names(),
+    metavar="A,B,...",
+    help="Names of the planes to point at, and whose error counts.  [default: all]",
+)
 @click.option(
     "--beam-mm",
     type=Numbers(2),
@@ -102,17 +108,13 @@ if TYPE_CHECKING:
 @click.option(
     "--distortion",
     type=click.Choice(["all", "none"]),
-    default="all",
-    show_default=True,
-    help="Whether the lens distortion will be estimated.",
+    help="Whether the lens distortion will be estimated.  [default: all; with --next as it was]",
 )
 @click.option(
     "--sigma-px",
     metavar="X",
     type=click.FloatRange(min=0, min_open=True),
-    default=1.0,
-    show_default=True,
-    help="Pixel noise that the promise assumes; with --next the calibration's own.",
+    help="Pixel noise that the promise assumes.  [default: 1; with --next the calibration's own]",
 )
 @click.option(
     "--seed",
@@ -153,6 +155,7 @@ def plan(
     groups: int | None,
     camera: str | None,
     laser: str | None,
+    planes: tuple[str, ...] | None,
     beam_mm: tuple[float, ...] | None,
     cone_deg: float | None,
     roll_deg: float | None,
@@ -160,8 +163,8 @@ def plan(
     box_mm: tuple[float, ...] | None,
     reach_mm: tuple[float, ...] | None,
     clearance_mm: float | None,
-    distortion: str,
-    sigma_px: float,
+    distortion: str | None,
+    sigma_px: float | None,
     seed: int,
     rotation: str,
     transform: Literal["T_base_hand", "T_hand_base"],
@@ -177,6 +180,11 @@ def plan(
         raise click.UsageError("--procedure and --next are two ways to plan; give one")
     if groups is not None and number is not None:
         raise click.UsageError("--procedure plans ten poses for each group; leave -n out")
+    if go_on and (distortion is not None or sigma_px is not None):
+        raise click.UsageError(
+            "--next takes the distortion terms and the pixel noise from the calibration; leave "
+            "--distortion and --sigma-px out"
+        )
     from lasercal_gtsam.plan import next_poses, procedure
     from lasercal_gtsam.plan import plan as make
 
@@ -184,13 +192,22 @@ def plan(
     limits = _limits(
         earlier, beam_mm, cone_deg, roll_deg, margin_px, box_mm, reach_mm, clearance_mm
     )
-    names: dict[str, Any] = {"camera": camera, "laser": laser, "limits": limits, "seed": seed}
+    names: dict[str, Any] = {
+        "camera": camera,
+        "laser": laser,
+        "planes": planes,
+        "limits": limits,
+        "seed": seed,
+    }
     if go_on:
         if earlier is None:
             raise DataError(f"{cell}: --next goes on from a calibration.json, this is only a cell")
         made = next_poses(earlier, 1 if number is None else number, **names)
     else:
-        names |= {"distortion": distortion == "all", "sigma_px": sigma_px}
+        names |= {
+            "distortion": distortion != "none",
+            "sigma_px": 1.0 if sigma_px is None else sigma_px,
+        }
         if groups is not None:
             made = procedure(rough, groups, **names)
         else:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
-from lasercal_gtsam.cli.values import Numbers
+from lasercal_gtsam.cli.values import Names, Numbers
 from lasercal_gtsam.errors import DataError
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from lasercal_gtsam.study import Study
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+_FAMILIES = ("M1", "M2", "M3", "M4")
 
 
 def _shared(trials: int) -> Callable[[F], F]:
@@ -114,7 +116,9 @@ def study() -> None:
     show_default=True,
     help="Noise, in multiples of 1 px, 1 mm and 0.05 deg.",
 )
-@click.option("--planes", metavar="A,B,...", help="Names of the planes to use.  [default: all]")
+@click.option(
+    "--planes", type=Names(), metavar="A,B,...", help="Names of the planes to use.  [default: all]"
+)
 @click.option(
     "--groups",
     metavar="N",
@@ -129,9 +133,12 @@ def study() -> None:
 )
 @click.option(
     "--methods",
+    type=Names(*_FAMILIES),
+    default=",".join(_FAMILIES),
     metavar="M1,M2,...",
     help="Families to compare, out of M1 (laser), M2 (Ma), M3 (Malm & Heyden), M4 (Horaud & "
-    "Dornaika).  [default: all]",
+    "Dornaika).",
+    show_default=True,
 )
 def fig6(
     output: Path | None,
@@ -143,10 +150,10 @@ def fig6(
     cell: Path | None,
     design: str | None,
     levels: tuple[float, ...],
-    planes: str | None,
+    planes: tuple[str, ...] | None,
     groups: int | None,
     shots: int | None,
-    methods: str | None,
+    methods: tuple[str, ...],
 ) -> None:
     """Relative errors of f_u, R and T for the laser method (M1) and those it is compared with.
 
@@ -156,12 +163,9 @@ def fig6(
     from lasercal_gtsam.study.cells import StudyCell
     from lasercal_gtsam.study.fig6_runs import METHODS
 
-    families = ["M1", "M2", "M3", "M4"] if methods is None else _names(methods)
-    if unknown := [f for f in families if f not in ("M1", "M2", "M3", "M4")]:
-        raise click.UsageError(f"--methods: {unknown[0]!r} is not one of M1, M2, M3, M4")
     chosen = StudyCell(
         cell=_cell(cell),
-        planes=None if planes is None else tuple(_names(planes)),
+        planes=planes,
         groups=groups,
         shots=shots,
         design=design,
@@ -170,7 +174,7 @@ def fig6(
         "trials": trials,
         "levels": levels,
         "cell": chosen,
-        "methods": [m for m in METHODS if m[:2] in families],
+        "methods": [m for m in METHODS if m[:2] in methods],
         "seed": seed,
     }
     _finish(_run(run, settings, "fig6", jobs, cluster, output), output, as_json)
@@ -240,6 +244,7 @@ def fig7(
 @_shared(60)
 @click.option(
     "--tests",
+    type=Names("1", "2", "3", "4"),
     metavar="1,2,...",
     default="1,2,3,4",
     show_default=True,
@@ -257,18 +262,15 @@ def table2(
     jobs: int | None,
     cluster: str | None,
     as_json: bool,
-    tests: str,
+    tests: tuple[str, ...],
     design: str | None,
 ) -> None:
     """Estimates and sigmas of simulated cells of the kind of Table 2, beside the printed sigmas."""
     from lasercal_gtsam.study import table2 as run
 
-    wanted = _names(tests)
-    if unknown := [t for t in wanted if t not in ("1", "2", "3", "4")]:
-        raise click.UsageError(f"--tests: {unknown[0]!r} is not one of 1, 2, 3, 4")
     settings = {
         "trials": trials,
-        "tests": [f"Test {t}" for t in wanted],
+        "tests": [f"Test {t}" for t in tests],
         "design": design,
         "seed": seed,
     }
@@ -288,15 +290,25 @@ def _run(
     workers: Workers = workers_for(jobs, cluster)
     journal = None
     if output is not None:
-        output.mkdir(parents=True, exist_ok=True)
+        try:
+            output.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DataError(f"{output}: cannot be a folder of results: {error.strerror}") from None
         journal = output / f"{name}.journal"
-    with progress("Runs") as show:
-        found = function(
-            **settings,
-            workers=workers,
-            journal=journal,
-            progress=lambda p: show(p.done, p.runs),
-        )
+    try:
+        with progress("Runs", seldom=True) as show:
+            found = function(
+                **settings,
+                workers=workers,
+                journal=journal,
+                progress=lambda p: show(p.done, p.runs),
+            )
+    except KeyboardInterrupt:
+        if journal is not None:
+            click.echo(
+                f"The runs finished so far are in {journal}: the same command goes on.", err=True
+            )
+        raise
     notes = []
     if found.results.resumed:
         notes.append(f"{found.results.resumed} runs were in {journal} already")
@@ -392,7 +404,3 @@ def _cell(path: Path | None) -> Cell | None:
     from lasercal_gtsam.io.cell_file import load_cell
 
     return load_cell(path)
-
-
-def _names(text: str) -> list[str]:
-    return [part.strip() for part in text.split(",") if part.strip()]

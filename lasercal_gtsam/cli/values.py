@@ -129,6 +129,28 @@ class Numbers(_ParamType):
         return found
 
 
+class Names(_ParamType):
+    """One name or several between commas, each once; out of ``choices`` where these are given."""
+
+    name = "names"
+
+    def __init__(self, *choices: str) -> None:
+        self.choices = choices
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, ...]:
+        """Split at the commas."""
+        if isinstance(value, tuple):
+            return value
+        names = tuple(part.strip() for part in str(value).split(",") if part.strip())
+        if not names or len(set(names)) < len(names):
+            self.fail(f"expected names between commas, each once, got {value!r}", param, ctx)
+        if self.choices and (unknown := [n for n in names if n not in self.choices]):
+            self.fail(f"{unknown[0]!r} is not one of {', '.join(self.choices)}", param, ctx)
+        return names
+
+
 class PresetName(_ParamType):
     """Name of a simulated cell."""
 

@@ -94,8 +94,10 @@ def run_all(
         The journal belongs to another work, or cannot be written; no cluster answers.
     SolveError
         Workers died again and again at the same runs; names them.
+    LasercalError
+        That of a run, as it is. What was finished before is in the journal.
     RunError
-        A run raised: a bug. What was finished before is in the journal.
+        A run raised anything else: a bug. The same.
     """
     workers = workers or OneProcess()
     with nullcontext() if journal is None else Record(journal, work) as record:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.errors import DataError, LasercalError
 
 Run = Callable[[Mapping[str, Any], int], Any]
 
@@ -66,6 +66,8 @@ def run_chunk(function: Run, spec: Mapping[str, Any], first: int, last: int) -> 
     for k in range(first, last):
         try:
             results.append(plain(function(spec, k)))
+        except LasercalError:  # what a user can mend, such as a cell in which nothing is seen
+            raise
         except Exception as error:
             raise RunError(f"run {k} broke: {type(error).__name__}: {error}") from error
     return Done(first, results, time.perf_counter() - begin)

@@ -10,7 +10,7 @@ import os
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import CancelledError, Executor, Future, ProcessPoolExecutor
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
 from lasercal_gtsam.errors import DataError, SolveError
+from lasercal_gtsam.io.calibration_file import program_version
 
 T = TypeVar("T")
 
@@ -74,8 +75,8 @@ class Processes:
 class Cluster:
     """A Dask cluster at an address such as ``tcp://scheduler:8786``.
 
-    Each worker needs this package in the same version. Dask runs a chunk elsewhere when its worker
-    dies.
+    Each worker needs this package in the same version; others are refused. Dask runs a chunk
+    elsewhere when its worker dies.
     """
 
     address: str
@@ -91,6 +92,7 @@ class Cluster:
     def open(self) -> Iterator[Executor]:
         """Give the executor of a client."""
         with self._client() as client:
+            _refuse_other_versions(client.run(program_version))
             executor = client.get_executor(pure=False, retries=3)
             try:
                 yield executor
@@ -146,6 +148,17 @@ def workers_for(jobs: int | None = None, cluster: str | None = None) -> Workers:
     if isinstance(jobs, bool) or not isinstance(jobs, int) or jobs < 1:
         raise DataError(f"jobs: expected an integer >= 1, got {jobs!r}")
     return OneProcess() if jobs == 1 else Processes(jobs)
+
+
+def _refuse_other_versions(there: Mapping[str, str]) -> None:
+    """Results of two versions must not be mixed; ``there`` is worker -> version."""
+    here = program_version()
+    others = [f"{worker} has {version}" for worker, version in there.items() if version != here]
+    if others:
+        raise DataError(
+            f"the cluster's workers need lasercal-gtsam {here} as here, but {', '.join(others)}; "
+            "install the same there"
+        )
 
 
 def _lost_cluster() -> tuple[type[BaseException], ...]:

@@ -24,7 +24,6 @@ from lasercal_gtsam.prediction import CellUncertainty, located_jacobian, spot_ja
 from lasercal_gtsam.report_map import tangent_labels
 
 Index = npt.NDArray[np.int64]
-Mask = npt.NDArray[np.bool_]
 
 _GRID = (16, 12)
 _SWEEPS = 4
@@ -40,8 +39,9 @@ class Problem:
     ----------
     cell, camera, laser : what is planned for
     labels : of all tangent coordinates
-    free : (n,) which of them are estimated
-    grid : plane -> (G, 3, m) derivative of `locate` at the grid by the free coordinates, metres
+    basis : (n, m) the directions out of these that are estimated, as columns; a column of the
+        identity where a coordinate is free by itself
+    grid : plane -> (G, 3, m) derivative of `locate` at the grid along these directions, metres
     places : plane -> (G, 3) the grid's points, base
     """
 
@@ -49,12 +49,12 @@ class Problem:
     camera: str
     laser: str
     labels: tuple[str, ...]
-    free: Mask
+    basis: Array
     grid: dict[str, Array]
     places: dict[str, Array]
 
     @classmethod
-    def of(cls, cell: Cell, camera: str, laser: str, free: Mask, limits: Limits) -> Problem:
+    def of(cls, cell: Cell, camera: str, laser: str, basis: Array, limits: Limits) -> Problem:
         """Lay a grid over the part of each plane that the camera sees within the limits' depth.
 
         Raises
@@ -84,18 +84,18 @@ class Problem:
                 )
             full = np.zeros((int(seen.sum()), 3, len(labels)))
             full[:, :, unknown.columns(camera, None, name)] = J[seen]
-            grid[name], places[name] = full[:, :, free], points[seen]
-        return cls(cell, camera, laser, labels, free, grid, places)
+            grid[name], places[name] = full @ basis, points[seen]
+        return cls(cell, camera, laser, labels, basis, grid, places)
 
     @property
     def weight(self) -> Array:
         """W (m, m): ``tr(W C)`` is the mean square error of `locate`, m^2."""
-        m = int(self.free.sum())
+        m = self.basis.shape[1]
         parts = [np.einsum("gia,gib->ab", G, G, optimize=True) / len(G) for G in self.grid.values()]
         return np.asarray(sum(parts, np.zeros((m, m))) / len(parts))
 
     def rows(self, T_base_hand: Array, plane: Names) -> Array:
-        """Derivative (N, 2, m) of the pixels of shots by the free coordinates."""
+        """Derivative (N, 2, m) of the pixels of shots along the estimated directions."""
         out = np.zeros((len(plane), 2, len(self.labels)))
         unknown = CellUncertainty(self.cell, np.eye(len(self.labels)), self.labels)
         for name in self.cell.planes:
@@ -104,7 +104,7 @@ class Problem:
                 _, J = spot_jacobian(self.cell, T_base_hand[on], name, self.camera, self.laser)
                 columns = unknown.columns(self.camera, self.laser, name)
                 out[on[:, None], :, columns] = np.swapaxes(J, 1, 2)
-        return np.asarray(out[:, :, self.free])
+        return np.asarray(out @ self.basis)
 
     def error_map(self, covariance: Array) -> dict[str, Array]:
         """Sigma of `locate` at the grid of each plane, (G,) metres: root of the trace."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ from lasercal_gtsam.observability import plausible_ranges
 from lasercal_gtsam.observations import Names, Observations
 from lasercal_gtsam.options import DISTORTION_NAMES
 from lasercal_gtsam.plan.candidates import candidate_poses
-from lasercal_gtsam.plan.design import Mask, Problem, choose, covariance_of
+from lasercal_gtsam.plan.design import Problem, choose, covariance_of
 from lasercal_gtsam.plan.limits import Limits
 from lasercal_gtsam.prediction import only
 from lasercal_gtsam.projection import project
@@ -28,6 +28,8 @@ from lasercal_gtsam.simulate.streams import MOTIONS, stream
 
 SHOTS = 10
 _ROTATIONS, _SHOTS_OF_ROTATION = 4, 120
+# a direction whose variance is below this share of its coordinates' is held by a constraint
+_HELD_VARIANCE = 1e-12
 # the one-plane calibration holds these, as the paper does
 _HELD_ON_ONE_PLANE = ("u0", "v0", "skew")
 
@@ -121,6 +123,7 @@ def plan(
     *,
     camera: str | None = None,
     laser: str | None = None,
+    planes: Sequence[str] | None = None,
     limits: Limits | None = None,
     distortion: bool = True,
     sigma_px: float = 1.0,
@@ -134,6 +137,7 @@ def plan(
     cell : known roughly, from drawings or an earlier calibration
     count : how many poses
     camera, laser : names; may be left out where the cell has one
+    planes : names of those to point at, and whose error counts; None: all
     limits : of the robot; see `Limits`
     distortion : whether the lens distortion will be estimated
     sigma_px : noise of a pixel coordinate
@@ -145,11 +149,9 @@ def plan(
     DataError
         Unknown names, a count that is not possible, or limits that leave no poses.
     """
-    problem, limits = _problem(cell, camera, laser, limits, distortion)
-    ranges = plausible_ranges(problem.labels)[problem.free]
-    return _chosen(
-        problem, limits, np.diag(1.0 / ranges**2), None, count, sigma_px, rotations, seed
-    )
+    problem, limits = _problem(cell, camera, laser, planes, limits, distortion)
+    prior = _plausible(problem)
+    return _chosen(problem, limits, prior, None, count, sigma_px, rotations, seed)
 
 
 def next_poses(
@@ -158,19 +160,20 @@ def next_poses(
     *,
     camera: str | None = None,
     laser: str | None = None,
+    planes: Sequence[str] | None = None,
     limits: Limits | None = None,
     rotations: int = _ROTATIONS,
     seed: int = 0,
 ) -> Plan:
     """Pick the next poses for a calibration that has spots already.
 
-    What it holds fixed stays so; its own pixel sigma is the noise. Without limits the hand keeps to
-    rotations near those that it took so far.
+    What it holds fixed stays so, a known aspect ratio too; its own pixel sigma is the noise.
+    Without limits the hand keeps to rotations near those that it took so far.
 
     Parameters
     ----------
     calibration : with a covariance
-    count, camera, laser, limits, rotations, seed : as in `plan`
+    count, camera, laser, planes, limits, rotations, seed : as in `plan`
 
     Raises
     ------
@@ -179,24 +182,22 @@ def next_poses(
     """
     cell = calibration.cell
     limits = limits or limits_of(calibration)
-    problem, limits = _problem(cell, camera, laser, limits, True)
+    problem, limits = _problem(cell, camera, laser, planes, limits, True)
     where = {label: i for i, label in enumerate(calibration.labels)}
-    at = [where.get(label, -1) for label in problem.labels]
-    variance = np.array([calibration.covariance[i, i] if i >= 0 else 0.0 for i in at])
-    if not np.isfinite(variance).all():
+    at = np.array([where.get(label, -1) for label in problem.labels])
+    known = at >= 0
+    covariance = np.zeros((len(at), len(at)))
+    covariance[np.ix_(known, known)] = calibration.covariance[np.ix_(at[known], at[known])]
+    if not np.isfinite(covariance).all():
         raise DataError(
             "plan: the calibration states no covariance; calibrate again with more spots first"
         )
-    free = np.asarray(variance > 0)
-    if not free.any():
+    if not (np.diag(covariance) > 0).any():
         raise DataError("plan: the calibration holds everything fixed; there is nothing to gain")
-    problem = Problem.of(cell, problem.camera, problem.laser, free, limits)
-    rows = [i for i, is_free in zip(at, free, strict=True) if is_free]
-    covariance = calibration.covariance[np.ix_(rows, rows)]
-    scale = np.sqrt(np.diag(covariance))
-    information = np.linalg.pinv(covariance / np.outer(scale, scale), hermitian=True)
-    prior = information / np.outer(scale, scale)
-    before = problem.mean_error(covariance)
+    basis, variances = _uncertain_directions(covariance)
+    problem = Problem.of(problem.cell, problem.camera, problem.laser, basis, limits)
+    before = problem.mean_error(np.diag(variances))
+    prior = np.diag(1.0 / variances)
     sigma_px = _pixel_sigma(calibration)
     return _chosen(problem, limits, prior, before, count, sigma_px, rotations, seed)
 
@@ -207,6 +208,7 @@ def procedure(
     *,
     camera: str | None = None,
     laser: str | None = None,
+    planes: Sequence[str] | None = None,
     limits: Limits | None = None,
     distortion: bool = True,
     sigma_px: float = 1.0,
@@ -217,7 +219,7 @@ def procedure(
     Parameters
     ----------
     groups : hand rotations on each plane
-    cell, camera, laser, limits, distortion, sigma_px, seed : as in `plan`
+    cell, camera, laser, planes, limits, distortion, sigma_px, seed : as in `plan`
 
     Raises
     ------
@@ -226,7 +228,7 @@ def procedure(
     """
     if groups < 1:
         raise DataError(f"plan: groups: expected an integer >= 1, got {groups}")
-    problem, limits = _problem(cell, camera, laser, limits, distortion)
+    problem, limits = _problem(cell, camera, laser, planes, limits, distortion)
     design = MotionDesign(
         beam_length=limits.beam_length,
         cone=limits.cone,
@@ -252,26 +254,57 @@ def procedure(
             )
         poses += found
         planes += [name] * (groups * SHOTS)
-    ranges = plausible_ranges(problem.labels)[problem.free]
-    prior = np.diag(1.0 / ranges**2)
+    prior = _plausible(problem)
     return _made(problem, np.concatenate(poses), np.array(planes), prior, None, sigma_px)
 
 
 def _problem(
-    cell: Cell, camera: str | None, laser: str | None, limits: Limits | None, distortion: bool
+    cell: Cell,
+    camera: str | None,
+    laser: str | None,
+    planes: Sequence[str] | None,
+    limits: Limits | None,
+    distortion: bool,
 ) -> tuple[Problem, Limits]:
     limits = limits or Limits()
     seen = only(tuple(cell.cameras), camera, "camera")
     lit = only(tuple(cell.lasers), laser, "laser")
-    if len(cell.cameras) > 1 or len(cell.lasers) > 1:
-        part = Cell({seen: cell.cameras[seen]}, {lit: cell.lasers[lit]}, dict(cell.planes))
-    else:
-        part = cell
+    chosen = tuple(cell.planes) if planes is None else tuple(planes)
+    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(cell.planes):
+        raise DataError(
+            f"plan: planes: expected some of {', '.join(cell.planes)}, each once, got "
+            f"{', '.join(map(repr, chosen)) or 'none'}"
+        )
+    part = Cell(
+        {seen: cell.cameras[seen]},
+        {lit: cell.lasers[lit]},
+        {name: plane for name, plane in cell.planes.items() if name in chosen},
+    )
     held = set() if distortion else set(DISTORTION_NAMES)
-    held |= set(_HELD_ON_ONE_PLANE) if len(cell.planes) == 1 else set()
+    held |= set(_HELD_ON_ONE_PLANE) if len(part.planes) == 1 else set()
     labels = tangent_labels(part)
-    free: Mask = np.array([label.rpartition(".")[2] not in held for label in labels])
-    return Problem.of(part, seen, lit, free, limits), limits
+    free = [label.rpartition(".")[2] not in held for label in labels]
+    return Problem.of(part, seen, lit, np.eye(len(labels))[:, free], limits), limits
+
+
+def _plausible(problem: Problem) -> Array:
+    """Information (m, m) of a cell of which only plausible ranges are known."""
+    ranges = plausible_ranges(problem.labels)
+    return problem.basis.T @ np.diag(1.0 / ranges**2) @ problem.basis
+
+
+def _uncertain_directions(covariance: Array) -> tuple[Array, Array]:
+    """Columns (n, m) that span what is uncertain, and their variances (m,): uncorrelated.
+
+    Coordinates that a constraint ties (f_u and f_v by a known aspect ratio) leave a direction
+    without variance, which stays out.
+    """
+    scale = np.sqrt(np.diag(covariance))
+    held = scale == 0
+    scale = np.where(held, 1.0, scale)
+    variances, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    uncertain = variances > _HELD_VARIANCE
+    return scale[:, None] * vectors[:, uncertain], variances[uncertain]
 
 
 def _chosen(

@@ -236,5 +236,5 @@ def _take(
 def _give_up(whose: str) -> None:
     raise DataError(
         f"study: no motions for {whose} method keep its points in the camera's view; it needs a "
-        "wider view at 0.2 to 0.35 m"
+        "wider view at 0.2 to 0.35 m. Leave the method out, or take another cell"
     )

@@ -32,7 +32,8 @@ class StudyCell:
     Raises
     ------
     DataError
-        Unknown names, or a cell with several cameras or lasers.
+        Unknown names, numbers that are none of groups or shots, or a cell with several cameras or
+        lasers.
     """
 
     preset: str = "paper"
@@ -56,6 +57,22 @@ class StudyCell:
                 f"study: the cell has {len(self.cell.cameras)} cameras and "
                 f"{len(self.cell.lasers)} lasers; give one with one of each"
             )
+        for what, value in (("groups", self.groups), ("shots", self.shots)):
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise DataError(f"study: {what}: expected an integer >= 1, got {value!r}")
+        if self.planes is not None:
+            there = self.truth(0).planes
+            if not self.planes or len(set(self.planes)) < len(self.planes):
+                raise DataError(f"study: planes: expected names, each once, got {self.planes}")
+            if unknown := [name for name in self.planes if name not in there]:
+                raise DataError(
+                    f"study: plane {unknown[0]!r} is not in the cell, which has {', '.join(there)}"
+                )
+
+    @property
+    def plane_count(self) -> int:
+        """Number of planes with spots."""
+        return len(self.truth(0).planes if self.planes is None else self.planes)
 
     def truth(self, seed: int) -> Cell:
         """The cell of a trial."""

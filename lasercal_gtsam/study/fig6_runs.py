@@ -67,6 +67,8 @@ METHODS = (
     HORAUD,
 )
 
+# the chain (16)-(35), which needs two planes or more
+_OF_SEVERAL_PLANES = {PAPER_CLOSED, REFINED_FROM_PAPER}
 _MA_STREAM, _MALM_STREAM, _HORAUD_STREAM = 101, 102, 103
 _FLAT_PATTERN_M = np.column_stack([MALM_PATTERN_M, np.zeros(len(MALM_PATTERN_M))])
 
@@ -76,6 +78,8 @@ T = TypeVar("T")
 
 def fig6_run(spec: Mapping[str, Any], k: int) -> dict[str, list[float] | None]:
     """One trial at one level: errors of f_u, R and T by method, None where it failed.
+
+    On one plane without the methods that need several.
 
     Parameters
     ----------
@@ -88,6 +92,8 @@ def fig6_run(spec: Mapping[str, Any], k: int) -> dict[str, list[float] | None]:
     seed = trial_seed(spec["entropy"], trial)
     noise = Noise.table1(level)
     wanted = set(spec["methods"])
+    if cell.plane_count < 2:
+        wanted -= _OF_SEVERAL_PLANES
     found: dict[str, Errors] = {}
     if wanted & set(METHODS[:6]):
         made = cell.simulated(seed, noise)

@@ -32,18 +32,13 @@ CASES = {
 METHODS = (PAPER_CLOSED, GENERAL, TRIANGULATION, REFINED)
 
 
-def planes_of(cell: StudyCell) -> int:
-    """Number of planes with spots."""
-    return len(cell.planes) if cell.planes is not None else len(cell.truth(0).planes)
-
-
 def combinations(spec: Mapping[str, Any]) -> list[tuple[str, int]]:
     """Case and number of samples of every run of a trial; whole groups on every plane only."""
     return [
         (case, n)
         for case, said in spec["cases"].items()
         for n in spec["samples"]
-        if n % (SHOTS * planes_of(StudyCell.from_plain(said))) == 0
+        if n % (SHOTS * StudyCell.from_plain(said).plane_count) == 0
     ]
 
 
@@ -59,7 +54,7 @@ def fig7_run(spec: Mapping[str, Any], k: int) -> dict[str, list[float] | None]:
     todo = combinations(spec)
     trial, (case, samples) = k // len(todo), todo[k % len(todo)]
     cell = StudyCell.from_plain(spec["cases"][case])
-    planes = planes_of(cell)
+    planes = cell.plane_count
     groups = samples // (SHOTS * planes)
     cell = StudyCell(cell.preset, cell.cell, cell.planes, groups, SHOTS, cell.design)
     made = cell.simulated(trial_seed(spec["entropy"], trial), Noise(pixel_px=spec["pixel_px"]))

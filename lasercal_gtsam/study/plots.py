@@ -9,6 +9,7 @@ import numpy as np
 
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.study.errors import QUANTITIES
+from lasercal_gtsam.study.fig6_runs import HORAUD
 from lasercal_gtsam.study.outcome import ErrorCurves
 from lasercal_gtsam.study.studies import Study
 from lasercal_gtsam.study.table2_runs import TestColumn
@@ -66,8 +67,8 @@ def _draw_fig6(figure: Figure, curves: ErrorCurves) -> None:
             if not curves.asked[:, m].any():
                 continue
             family = method[:2]
-            style = seen.get(family, 0)
-            seen[family] = style + 1
+            marker = seen.get(family, 0)
+            seen[family] = marker + 1
             _line(
                 ax,
                 curves,
@@ -75,8 +76,8 @@ def _draw_fig6(figure: Figure, curves: ErrorCurves) -> None:
                 q,
                 label=method,
                 color=_FAMILIES.get(family, "#555555"),
-                linestyle=_STYLES[style % len(_STYLES)],
-                marker=_MARKERS[style % len(_MARKERS)],
+                linestyle="-" if "refined" in method or method == HORAUD else "--",
+                marker=_MARKERS[marker % len(_MARKERS)],
             )
         _finish(ax, _LABELS[quantity], "noise level")
     handles, labels = axes[0].get_legend_handles_labels()
@@ -131,11 +132,21 @@ def _line(ax: Axes, curves: ErrorCurves, m: int, q: int, **style: Any) -> None:
 
 
 def _finish(ax: Axes, ylabel: str, xlabel: str) -> None:
-    ax.set_yscale("log")
+    _log_axis(ax)
     ax.set_xlabel(xlabel)
     ax.set_ylabel(ylabel)
     ax.grid(True, which="both", linewidth=0.3, alpha=0.6)
     ax.spines[["top", "right"]].set_visible(False)
+
+
+def _log_axis(ax: Axes) -> None:
+    """Logarithmic, with numbers as one writes them: 0.5, not 5 x 10^-1."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    ax.set_yscale("log")
+    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_table2(ax: Axes, columns: tuple[TestColumn, ...]) -> None:
@@ -152,7 +163,7 @@ def _draw_table2(ax: Axes, columns: tuple[TestColumn, ...]) -> None:
         )
     ax.axhspan(0.5, 2.0, color="#000000", alpha=0.06, linewidth=0)
     ax.axhline(1.0, color="#555555", linewidth=0.8)
-    ax.set_yscale("log")
+    _log_axis(ax)
     ax.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
     ax.set_ylabel("median sigma / printed sigma")
     ax.grid(True, axis="y", which="both", linewidth=0.3, alpha=0.6)

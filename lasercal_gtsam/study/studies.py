@@ -39,6 +39,7 @@ class Study:
     curves : name -> errors along an axis; Fig. 6 has one, Fig. 7 one for each case
     columns : the tests of Table 2
     findings : what agrees with the paper, and what does not
+    as_paper : whether cell, motions and noise are the paper's, so that its numbers compare
     """
 
     name: str
@@ -47,6 +48,7 @@ class Study:
     curves: Mapping[str, ErrorCurves]
     columns: tuple[TestColumn, ...]
     findings: tuple[Finding, ...]
+    as_paper: bool = True
 
     def table(self) -> str:
         """Text of all numbers."""
@@ -108,8 +110,9 @@ def fig6(
     if not methods:
         raise DataError("study: no method is left")
     at = [float(x) for x in levels]
+    cell = cell or StudyCell()
     spec = {
-        "cell": (cell or StudyCell()).to_plain(),
+        "cell": cell.to_plain(),
         "levels": at,
         "entropy": seed,
         "methods": list(methods),
@@ -117,8 +120,9 @@ def fig6(
     results = _run("fig6", _fig6.fig6_run, spec, trials * len(levels), workers, journal, progress)
     runs = {(k % len(levels), k // len(levels)): value for k, value in enumerate(results.values)}
     curves = ErrorCurves.of("Fig. 6", "noise level", at, methods, runs, trials)
-    found = tuple(fig6_findings(curves))
-    return Study("fig6", spec, results, {"fig6": curves}, (), found)
+    as_paper = cell == StudyCell()
+    found = tuple(fig6_findings(curves, as_paper))
+    return Study("fig6", spec, results, {"fig6": curves}, (), found, as_paper)
 
 
 def fig7(
@@ -180,7 +184,9 @@ def fig7(
                 if todo[k % len(todo)][0] == case
             }
             curves[case] = ErrorCurves.of(case, "samples", at, methods, runs, trials)
-    return Study("fig7", spec, results, curves, (), tuple(fig7_findings(curves)))
+    as_paper = pixel_px == 1.0 and all(_fig7.CASES.get(n) == c for n, c in chosen.items())
+    found = tuple(fig7_findings(curves, as_paper))
+    return Study("fig7", spec, results, curves, (), found, as_paper)
 
 
 def table2(
@@ -212,6 +218,10 @@ def table2(
         raise DataError(
             f"study: test {unknown[0]!r} is unknown; choose out of {', '.join(_table2.TESTS)}"
         )
+    if not tests:
+        raise DataError("study: no test is left")
+    if not tests:
+        raise DataError("study: no test is left")
     spec = {
         "tests": {
             name: {
@@ -225,7 +235,9 @@ def table2(
     work = ("table2", _table2.table2_run, spec, trials * len(tests))
     results = _run(*work, workers, journal, progress)
     columns = tuple(test_columns(spec, results.values))
-    return Study("table2", spec, results, {}, columns, tuple(table2_findings(columns)))
+    as_paper = design in (None, preset_named(_table2.TESTS[tests[0]]).design)
+    found = tuple(table2_findings(columns))
+    return Study("table2", spec, results, {}, columns, found, as_paper)
 
 
 def _run(

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.simulate.streams import NOISE, stream
 
 
@@ -39,6 +40,13 @@ def die_always(spec: Mapping[str, Any], k: int) -> dict[str, Any]:
 def fail(spec: Mapping[str, Any], k: int) -> float:
     """Run 5 has a bug."""
     return 1.0 / (5 - k)
+
+
+def refuse(spec: Mapping[str, Any], k: int) -> float:
+    """Run 2 finds the user's settings impossible."""
+    if k == 2:
+        raise DataError("the cell is too small", "the hand too large")
+    return 0.0
 
 
 def not_plain(spec: Mapping[str, Any], k: int) -> float:

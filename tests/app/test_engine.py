@@ -9,11 +9,13 @@ import time
 from pathlib import Path
 
 import pytest
-from engine_cases import die_always, die_once, draw, fail, not_plain, times_run
+from engine_cases import die_always, die_once, draw, fail, not_plain, refuse, times_run
 
 from lasercal_gtsam.engine import OneProcess, Processes, Work, apart, run_all, workers_for
 from lasercal_gtsam.engine.work import RunError
+from lasercal_gtsam.engine.workers import _refuse_other_versions
 from lasercal_gtsam.errors import DataError, SolveError
+from lasercal_gtsam.io.calibration_file import program_version
 from lasercal_gtsam.io.journal import JournalReader
 from lasercal_gtsam.simulate.streams import NOISE, stream
 
@@ -134,6 +136,20 @@ def test_a_bug_in_a_run_is_named_and_the_finished_runs_are_kept(tmp_path, worker
     with pytest.raises(RunError, match="run 5 broke: ZeroDivisionError"):
         run_all(Work("bug", fail, {}, 9), workers, journal=path, chunk_seconds=1e-9)
     assert sum(len(r.payload["results"]) for r in JournalReader(path)) >= 4
+
+
+@pytest.mark.parametrize("workers", [OneProcess(), Processes(1)])
+def test_what_a_user_can_mend_comes_through_as_it_is(workers):
+    with pytest.raises(DataError) as caught:
+        run_all(Work("refused", refuse, {}, 4), workers)
+    assert str(caught.value) == "the cell is too small\nthe hand too large"
+
+
+def test_workers_of_another_version_are_refused():
+    here = program_version()
+    _refuse_other_versions({"tcp://a:1": here})
+    with pytest.raises(DataError, match=f"need lasercal-gtsam {here} as here, but tcp://b:1 has 0"):
+        _refuse_other_versions({"tcp://a:1": here, "tcp://b:1": "0.0.1"})
 
 
 def test_what_json_cannot_say_is_refused():

@@ -91,7 +91,7 @@ def test_the_promise_is_the_covariance_of_the_calibration_itself(forty):
     seen = forty.observations()
     seen = replace(seen, uv=seen.uv + 1e-4 * rng.standard_normal(seen.uv.shape))
     found = lc.calibrate(seen, initial=CELL, options=lc.CalibrationOptions(robust="none"))
-    problem = Problem.of(CELL, "camera", "laser", np.ones(25, dtype=bool), Limits())
+    problem = Problem.of(CELL, "camera", "laser", np.eye(25), Limits())
     for name, points in problem.places.items():
         _, cov = found.locate(grid_pixels(points), plane=name)
         rms = np.sqrt(np.mean(np.trace(cov, axis1=1, axis2=2))) / found.fit.sigma0
@@ -102,7 +102,7 @@ def test_the_promise_is_the_covariance_of_the_calibration_itself(forty):
 def test_the_plan_keeps_its_promise_in_simulation_and_needs_no_start(forty):
     rng = np.random.default_rng(0)
     seen = forty.observations()
-    problem = Problem.of(CELL, "camera", "laser", np.ones(25, dtype=bool), Limits())
+    problem = Problem.of(CELL, "camera", "laser", np.eye(25), Limits())
     squares = {name: [] for name in CELL.planes}
     for _ in range(12):
         noisy = replace(seen, uv=seen.uv + rng.standard_normal(seen.uv.shape))
@@ -162,7 +162,7 @@ def test_the_next_poses_help_most_where_the_calibration_is_weak():
     extra = replace(seen, uv=uv + rng.standard_normal(uv.shape))
     second = lc.calibrate(made.observations + extra, initial=made.truth)
     for name in more.after:
-        problem = Problem.of(made.truth, "camera", "laser", np.ones(25, dtype=bool), Limits())
+        problem = Problem.of(made.truth, "camera", "laser", np.eye(25), Limits())
         before, after = (
             np.sqrt(np.mean(problem.error_map(c.covariance / c.fit.sigma0**2)[name] ** 2))
             for c in (first, second)
@@ -177,6 +177,42 @@ def test_next_keeps_what_is_held():
     more = next_poses(found, 2)
     assert set(more.plane) == {"1"}
     assert more.after["1"] < more.before["1"]
+
+
+def test_next_counts_a_tied_aspect_ratio_as_known():
+    """f_u and f_v are one unknown then: the promise is that of the covariance with both tied."""
+    made = simulate("paper-2", 3, NOISE, groups=3)
+    options = lc.CalibrationOptions(distortion="none", known={"aspect": 1.0, "skew": 0.0})
+    found = lc.calibrate(made.observations, options=options)
+    more = next_poses(found, 3)
+    problem = Problem.of(found.cell, "camera", "laser", np.eye(25), Limits())
+    rows = problem.rows(more.T_base_hand, more.plane)
+    C = covariance_in(found, problem.labels)
+    for J in rows.reshape(-1, 25):  # one equation after the other
+        gain = C @ J / (J @ C @ J + more.sigma_px**2)
+        C = C - np.outer(gain, J @ C)
+    for name in more.after:
+        expected = problem.mean_error(C)[name]
+        assert more.after[name] == pytest.approx(expected, rel=1e-3)
+        assert more.after[name] < more.before[name]
+
+
+def covariance_in(found, labels):
+    at = {label: i for i, label in enumerate(found.labels)}
+    C = np.zeros((len(labels), len(labels)))
+    for i, a in enumerate(labels):
+        for j, b in enumerate(labels):
+            if a in at and b in at:
+                C[i, j] = found.covariance[at[a], at[b]]
+    return C
+
+
+def test_some_planes_only():
+    one = plan(CELL, 10, planes=["2"])
+    assert set(one.plane) == set(one.after) == {"2"}
+    for wrong in (["3"], [], ["1", "1"]):
+        with pytest.raises(DataError, match="planes: expected some of 1, 2, each once"):
+            plan(CELL, 10, planes=wrong)
 
 
 def test_a_calibrations_habits_become_limits():
@@ -273,6 +309,11 @@ def test_the_command(tmp_path, cli):
     printed = cli("plan", file, "--next")
     assert "->" in printed.out
     assert "rotation vector (deg)" in printed.out
+    alone = cli.json("plan", file, "-n", "3", "--planes", "2")
+    assert [pose["plane"] for pose in alone["poses"]] == ["2"] * 3
+    taken = cli("plan", file, "--next", "--sigma-px", "2")
+    assert taken.status == 2
+    assert "--next takes the distortion terms and the pixel noise" in taken.err
     paper = cli("plan", file, "--procedure", "1")
     assert "20 poses: 10 on plane 1, 10 on plane 2." in paper.out
     cell = tmp_path / "cell.json"

@@ -11,16 +11,27 @@ import pytest
 from cli_support import Cli
 
 import lasercal_gtsam as lc
+from lasercal_gtsam.cli.console import _seldom
 from lasercal_gtsam.engine import OneProcess, Processes
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.rotations import make_pose, rotation_exp
 from lasercal_gtsam.simulate.cells import paper_cell
 from lasercal_gtsam.study import StudyCell, fig6, fig7, table2
 from lasercal_gtsam.study.errors import relative_errors
-from lasercal_gtsam.study.fig6_runs import HAND_NOISE, METHODS, REFINED, trial_seed
-from lasercal_gtsam.study.findings import Finding, fig6_findings
+from lasercal_gtsam.study.fig6_runs import (
+    HAND_NOISE,
+    METHODS,
+    PAPER_CLOSED,
+    REFINED,
+    REFINED_FROM_PAPER,
+    trial_seed,
+)
+from lasercal_gtsam.study.findings import Finding, fig6_findings, table2_findings
 from lasercal_gtsam.study.laser import FORMS, closed_form
 from lasercal_gtsam.study.outcome import ErrorCurves
+from lasercal_gtsam.study.page import page_of
+from lasercal_gtsam.study.printed import PRINTED_SIGMAS
+from lasercal_gtsam.study.table2_runs import TestColumn as Column
 from lasercal_gtsam.study.table2_runs import test_columns as columns_of
 
 
@@ -206,6 +217,70 @@ def test_an_own_cell_takes_the_place_of_the_papers():
         StudyCell(cell=replace(own, cameras={"a": wide, "b": wide}))
 
 
+def test_another_cell_is_not_held_against_the_papers_numbers():
+    settings = {"trials": 2, "levels": (1.0,), "methods": [*FAST, REFINED]}
+    papers = fig6(**settings)
+    other = fig6(**settings, cell=StudyCell(design="near"))
+    assert papers.as_paper
+    assert not other.as_paper
+    assert any("reference" in f.claim for f in papers.findings)
+    assert not any("reference" in f.claim for f in other.findings)
+    assert "Cell, motions or noise are not the paper" in page_of(other, "x")
+    assert "Cell, motions or noise are not the paper" not in page_of(papers, "x")
+    assert not fig7(trials=1, samples=(60,), pixel_px=0.5).as_paper
+    assert not table2(trials=1, tests=("Test 4",), design="near").as_paper
+
+
+def test_one_plane_is_studied_without_the_chain_that_needs_several():
+    study = fig6(trials=1, levels=(0.0,), cell=StudyCell("paper", planes=("1",)))
+    curves = study.curves["fig6"]
+    left_out = {m for m, was in zip(METHODS, curves.asked[0], strict=True) if not was}
+    assert left_out == {PAPER_CLOSED, REFINED_FROM_PAPER}
+    assert not curves.failures.any()
+    assert study.findings[0].holds is True
+
+
+def test_a_view_too_narrow_is_the_users_to_mend(monkeypatch):
+    monkeypatch.setattr("lasercal_gtsam.study.captures._MAX_TRIES", 20)
+    own = paper_cell(2)
+    camera = own.cameras["camera"]
+    narrow = replace(camera, intrinsics=replace(camera.intrinsics, fu=9e4, fv=9e4))
+    cell = StudyCell(cell=replace(own, cameras={"camera": narrow}))
+    with pytest.raises(DataError, match=r"no motions for Ma's method .* Leave the method out"):
+        fig6(trials=1, levels=(0.0,), cell=cell, methods=["M2 Ma"])
+
+
+def test_behind_by_less_than_the_scatter_is_too_few_trials_to_say():
+    errors = np.array([[[0.010, 0.014, 0.012], [0.011, 0.010, 0.013]]])
+    claim = "modelling the robot's noise improves the laser method"
+
+    def holds(values):
+        found = fig6_findings(curves_of(values, (HAND_NOISE, REFINED)), as_paper=False)
+        return next(f for f in found if f.claim == claim).holds
+
+    assert holds(errors) is None
+    assert holds(errors[:, ::-1]) is True
+    assert holds(errors * np.array([[[2.0], [1.0]]])) is False
+    failed = errors.copy()
+    failed[0, 0] = np.nan
+    assert holds(failed) is False
+
+
+def test_a_reason_covers_a_row_so_far_only():
+    def finding(ratios):
+        names = tuple(ratios)
+        printed = tuple(PRINTED_SIGMAS["Test 4"][n] for n in names)
+        sigma = tuple(p * r for p, r in zip(printed, ratios.values(), strict=True))
+        column = Column("Test 4", names, *([sigma] * 6), printed, 2.5, 2.5, captures=1, failed=())
+        return table2_findings([column])[0]
+
+    assert finding({"fu": 1.0, "Tz": 0.15, "a_2_x": 3.0}).holds is True
+    for name, ratio in (("fu", 2.5), ("Tz", 2.5), ("Tz", 0.05), ("a_2_x", 5.0), ("Ty", 0.1)):
+        found = finding({"a_2_y": 1.0, name: ratio})
+        assert found.holds is False
+        assert f"{name} {ratio:.2f}" in found.evidence
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -225,6 +300,12 @@ def test_wrong_settings_are_refused(settings, message):
 def test_wrong_settings_of_the_others_are_refused():
     with pytest.raises(DataError, match="expected multiples of 10 times the number of planes"):
         fig7(trials=1, samples=(7,))
+    with pytest.raises(DataError, match="plane '9' is not in the cell, which has 1, 2"):
+        StudyCell("paper-2", planes=("9",))
+    with pytest.raises(DataError, match="groups: expected an integer >= 1, got 0"):
+        StudyCell(groups=0)
+    with pytest.raises(DataError, match="no test is left"):
+        table2(trials=1, tests=())
     with pytest.raises(DataError, match="test 'Test 9' is unknown"):
         table2(trials=1, tests=("Test 9",))
 
@@ -278,15 +359,41 @@ def test_the_figures_are_drawn(tmp_path):
     ("args", "status", "message"),
     [
         (["fig6", "--levels", "a"], 2, "expected numbers between commas, got 'a'"),
-        (["fig6", "--methods", "M7"], 2, "--methods: 'M7' is not one of M1"),
+        (["fig6", "--methods", "M7"], 2, "'--methods': 'M7' is not one of M1"),
         (["fig7", "--samples", "30.5"], 2, "expected whole numbers"),
-        (["table2", "--tests", "5"], 2, "--tests: '5' is not one of 1, 2, 3, 4"),
+        (["table2", "--tests", "5"], 2, "'--tests': '5' is not one of 1, 2, 3, 4"),
         (["fig6", "--jobs", "2", "--cluster", "tcp://a:1"], 1, "not both"),
         (["fig6", "--cell", "nothing.json"], 1, "nothing.json: there is no such file"),
         (["fig6", "--design", "wild"], 1, "motion design 'wild' is unknown"),
+        (["fig6", "--planes", "7"], 1, "plane '7' is not in the cell, which has 1, 2, 3"),
+        (["fig6", "--planes", "1,1"], 2, "expected names between commas, each once, got '1,1'"),
+        (["table2", "--tests", ""], 2, "expected names between commas, each once"),
+        (["fig7", "-o", "/dev/null/out"], 1, "/dev/null/out: cannot be a folder of results"),
     ],
 )
 def test_wrong_options_are_refused(args, status, message, cli):
     result = cli("study", *args)
     assert result.status == status
     assert message in result.err
+
+
+def test_an_interruption_says_how_to_go_on(tmp_path, cli, monkeypatch):
+    def interrupted(**settings):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lasercal_gtsam.study.fig6", interrupted)
+    done = cli("study", "fig6", "-j", "1", "-o", tmp_path / "out")
+    assert done.status == 130
+    assert f"are in {tmp_path / 'out' / 'fig6.journal'}: the same command goes on" in done.err
+
+
+def test_a_log_gets_a_line_a_minute(capsys):
+    times = iter([0.0, 1.0, 30.0, 61.0, 90.0, 121.0, 181.0])
+    show = _seldom("Runs", lambda: next(times))
+    for done in (1, 50, 101, 150, 201, 300):
+        show(done, 300)
+    # 100 runs in the minute behind the first call, then 200 in two
+    assert capsys.readouterr().err.splitlines() == [
+        "Runs: 101 of 300, about 2 min left",
+        "Runs: 201 of 300, about 1 min left",
+    ]

@@ -233,3 +233,41 @@ def test_captures_need_a_view_wide_enough():
     narrow = replace(CAMERA, intrinsics=replace(CAMERA.intrinsics, fu=9000.0, fv=9000.0))
     with pytest.raises(DataError, match="it needs a wider view"):
         horaud_views(narrow, EXACT, rng(0))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_poses_may_be_rounded_as_robots_round_them(seed):
+    """To 1 um and 1e-5 in the rotation matrix: orthogonal, and one orientation, only nearly."""
+    made = ma_views(CAMERA, EXACT, rng(seed))
+    rounded = HandViews(made.views.uv, made.views.T_base_hand.round(6), CAMERA.image_size)
+    turned = np.array(rounded.T_base_hand)
+    turned[::2, :3, :3] += 1e-5
+    views = HandViews(made.views.uv, turned, CAMERA.image_size)
+    found = calibrate_ma(views, orthogonal=1e-4)
+    assert found.K[0, 0] == pytest.approx(550.0, rel=1e-2)
+
+
+def test_two_shots_of_one_pose_are_named():
+    views = malm_views(CAMERA, EXACT, rng(1)).views
+    T = np.array(views.T_base_hand)
+    T[1] = T[0]
+    with pytest.raises(DataError, match="shots 0 and 1 have the same hand pose"):
+        calibrate_malm_heyden(HandViews(views.uv, T, CAMERA.image_size), MALM_PATTERN_M)
+
+
+def test_half_turns_do_not_spoil_the_hand_eye():
+    """Noise swaps the axis of half a turn for its opposite; such motions are left out of it."""
+    Y = make_pose(Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix(), np.array([0.1, 0.0, 0.2]))
+    seen = make_pose(np.eye(3), np.array([0.0, 0.0, 0.5]))
+    vectors = np.array([[0, 0, 0], [np.pi, 0, 0], [0.5, 0, 0.2], [0, 0.7, 0], [0.1, 0.2, 0.6]])
+    jitter = Rotation.from_rotvec([-1e-3, 0.0, 0.0])
+    hands, M = [], []
+    for k, vector in enumerate(vectors):
+        turn = Rotation.from_rotvec(vector)
+        move = make_pose(turn.as_matrix(), np.array([0.01 * k, 0.0, 0.02 * k]))
+        hands.append(np.linalg.inv(move))
+        noisy = make_pose((turn * jitter).as_matrix() if k == 1 else turn.as_matrix(), move[:3, 3])
+        # object to camera: fixed camera in the base, Y takes the hand to the object
+        M.append((seen @ np.linalg.inv(noisy) @ np.linalg.inv(Y))[:3])
+    closed, _ = hand_in_object(np.array(M), np.array(hands))
+    np.testing.assert_allclose(closed[:3, :3], Y[:3, :3], atol=2e-3)

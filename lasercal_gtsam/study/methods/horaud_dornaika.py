@@ -28,6 +28,8 @@ from lasercal_gtsam.study.methods.views import EyeToHand, HandViews
 _LENGTH_SCALE_M = 0.1
 # motions that turn less than this say nothing about the rotation
 _LEAST_TURN_RAD = 1e-6
+# close to half a turn an axis and its opposite are one, so that noise may swap them
+_MOST_TURN_RAD = np.pi - 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,10 +121,14 @@ def hand_in_object(M: Array, T_base_hand: Array) -> tuple[Array, Array]:
     nu = np.linalg.solve(S[1:], (s[0] - s[1:])[..., None])[..., 0]
     B = np.linalg.solve(T_base_hand[1:], np.broadcast_to(T_base_hand[0], T_base_hand[1:].shape))
     n, b = np.array([rotation_log(r) for r in N]), np.array([rotation_log(r[:3, :3]) for r in B])
-    turned = np.linalg.norm(b, axis=1) > _LEAST_TURN_RAD
+    angle = np.linalg.norm(b, axis=1)
+    turned = (angle > _LEAST_TURN_RAD) & (angle < _MOST_TURN_RAD)
     n, b = _unit(n[turned]), _unit(b[turned])
     if len(b) < 2 or np.linalg.svd(b, compute_uv=False)[1] < 1e-6:
-        raise DegenerateError("the hand turns about one axis only; turn it about another one too")
+        raise DegenerateError(
+            "from the first shot the hand turns about one axis only, or by half a turn, which has "
+            "no sign; turn it about another axis too"
+        )
     R = nearest_rotation(n.T @ b)
     A = (N - np.eye(3)).reshape(-1, 3)
 

@@ -18,11 +18,12 @@ from lasercal_gtsam.rotations import make_pose, nearest_rotation, skew
 from lasercal_gtsam.study.methods.conic import conic_rows, intrinsics_from_conic
 from lasercal_gtsam.study.methods.views import EyeToHand, HandViews
 
-# commanded directions count as orthogonal up to this cosine
 _ORTHOGONAL = 1e-6
 
 
-def calibrate_ma(views: HandViews, *, zero_skew: bool = False) -> EyeToHand:
+def calibrate_ma(
+    views: HandViews, *, zero_skew: bool = False, orthogonal: float = _ORTHOGONAL
+) -> EyeToHand:
     """Solve in closed form: foci of expansion, conic, rotation, then the rest linearly.
 
     Every shot of an orientation but its first is a translation from the first. Translations of one
@@ -32,6 +33,8 @@ def calibrate_ma(views: HandViews, *, zero_skew: bool = False) -> EyeToHand:
     ----------
     views : two points or more, translations in orthogonal pairs from three orientations or more
     zero_skew : whether the skew is known to be zero
+    orthogonal : commanded directions count as orthogonal up to this cosine; larger where the poses
+        are rounded
 
     Returns
     -------
@@ -49,9 +52,15 @@ def calibrate_ma(views: HandViews, *, zero_skew: bool = False) -> EyeToHand:
     rows = [
         conic_rows(e[a], e[b])
         for a, b in combinations(range(len(e)), 2)
-        if group[a] == group[b] and abs(float(d[a] @ d[b])) < _ORTHOGONAL
+        if group[a] == group[b] and abs(float(d[a] @ d[b])) < orthogonal
     ]
-    K_scaled = intrinsics_from_conic(np.array(rows).reshape(-1, 6), zero_skew)
+    if not rows:
+        raise DegenerateError(
+            f"no two translations of one orientation are orthogonal (cosine below {orthogonal:g});"
+            " move the hand along orthogonal directions without turning it, or, for poses that "
+            "are rounded, give a larger 'orthogonal'"
+        )
+    K_scaled = intrinsics_from_conic(np.array(rows), zero_skew)
     v = np.linalg.solve(K_scaled, e.T).T
     v /= np.linalg.norm(v, axis=1, keepdims=True)
     R_cb = nearest_rotation(v.T @ d)

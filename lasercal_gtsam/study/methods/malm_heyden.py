@@ -41,7 +41,7 @@ def calibrate_malm_heyden(
     Raises
     ------
     DataError
-        ``pattern`` does not match the views.
+        ``pattern`` does not match the views, or two shots of one orientation have one position.
     DegenerateError
         Too few orientations or translations, or no camera explains them.
     """
@@ -54,6 +54,14 @@ def calibrate_malm_heyden(
     groups = [shots for shots in views.orientations() if len(shots) > 1]
     if not groups:
         raise DegenerateError("the hand never translates: no scale for the pattern's images")
+    for shots in groups:
+        moves = np.linalg.norm(views.t[shots[1:]] - views.t[shots[0]], axis=1)
+        if not (moves > 0).all():
+            again = shots[1:][~(moves > 0)][0]
+            raise DataError(
+                f"calibrate_malm_heyden: shots {shots[0]} and {again} have the same hand pose; "
+                "leave one out"
+            )
     maps = [_pattern_map(views, shots, pattern) for shots in groups]
     rows = [_conic_equations(views, shots, H) for shots, H in zip(groups, maps, strict=True)]
     K_scaled = intrinsics_from_conic(np.concatenate(rows), zero_skew)

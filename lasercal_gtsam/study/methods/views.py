@@ -6,13 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD
 from lasercal_gtsam.closed_form.spots import pixel_scaling
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array, FrozenData, set_array
 from lasercal_gtsam.observations import Index
-
-# commanded rotations closer than this are one orientation of the hand
-_SAME_ROTATION_RAD = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +54,15 @@ class HandViews(FrozenData):
         return np.asarray(rows @ self.scaling.T)
 
     def orientations(self) -> list[Index]:
-        """Shots of each hand orientation, in their order; the first is the translations' start."""
+        """Shots of each hand orientation, in their order; the first is the translations' start.
+
+        Commanded rotations within 0.05 deg are one orientation, as for the laser method: robots
+        round what they report.
+        """
         found: list[list[int]] = []
         for k, R in enumerate(self.R):
             for group in found:
-                if np.linalg.norm(R - self.R[group[0]]) < _SAME_ROTATION_RAD * np.sqrt(2.0):
+                if np.linalg.norm(R - self.R[group[0]]) < GROUP_TOLERANCE_RAD * np.sqrt(2.0):
                     group.append(k)
                     break
             else:
