@@ -11,19 +11,30 @@ import numpy as np
 from lasercal_gtsam.calibration import Calibration
 from lasercal_gtsam.comparison.result import Change, InputsChange
 from lasercal_gtsam.figures.spots import rejected_spots
+from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.origin import Origin
 from lasercal_gtsam.io.plain import plain
 from lasercal_gtsam.observations import Observations
 
+# of pixels and metres: far below what anybody measures, far above what arithmetic changes
+_DECIMALS = 9
+
 
 def measurements(seen: Observations) -> list[bytes]:
-    """What tells one measurement from another: pixel, hand pose, camera, laser and plane."""
+    """What tells one measurement from another: pixel, hand pose, camera, laser and plane.
+
+    Rounded, since a pose may have been made orthonormal again on its way.
+    """
     return [
-        b"\0".join([uv.tobytes(), T.tobytes(), *(str(n).encode() for n in (camera, laser, plane))])
+        b"\0".join([_rounded(uv), _rounded(T), *(str(n).encode() for n in (camera, laser, plane))])
         for uv, T, camera, laser, plane in zip(
             seen.uv, seen.T_base_hand, seen.camera, seen.laser, seen.plane, strict=True
         )
     ]
+
+
+def _rounded(values: Array) -> bytes:
+    return bytes((np.round(values, _DECIMALS) + 0.0).tobytes())
 
 
 def inputs_change(a: Calibration, b: Calibration, origins: tuple[Origin, Origin]) -> InputsChange:
@@ -35,7 +46,7 @@ def inputs_change(a: Calibration, b: Calibration, origins: tuple[Origin, Origin]
     alone_b = np.array([key not in in_a for key in keys_b], dtype=np.bool_)
     only_a, only_b = seen_a.id[alone_a].tolist(), seen_b.id[alone_b].tolist()
     ids_b = set(only_b)
-    poses_a = {T.tobytes() for T in seen_a.T_base_hand[alone_a]}
+    poses_a = {_rounded(T) for T in seen_a.T_base_hand[alone_a]}
     out = dict(zip(keys_b, rejected_spots(b).tolist(), strict=True))
     disputed = [
         str(name)
@@ -49,7 +60,7 @@ def inputs_change(a: Calibration, b: Calibration, origins: tuple[Origin, Origin]
         only_a=tuple(only_a),
         only_b=tuple(only_b),
         altered=tuple(name for name in only_a if name in ids_b),
-        same_pose=sum(T.tobytes() in poses_a for T in seen_b.T_base_hand[alone_b]),
+        same_pose=sum(_rounded(T) in poses_a for T in seen_b.T_base_hand[alone_b]),
         rejected=tuple(disputed),
         options=tuple(
             Change(f.name, _text(x), _text(y))

@@ -171,7 +171,7 @@ class InputsChange:
     altered : ids that both have with other values (other spots under the same name, or the same
         picture looked at anew)
     same_pose : of the spots that one alone has, how many have the hand pose of one that the other
-        alone has, to the last digit
+        alone has
     rejected : ids of shared spots that one left out and the other used
     options : options that differ
     files : files that differ, by SHA-256

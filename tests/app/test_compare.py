@@ -64,6 +64,19 @@ def test_nested_data_differ_by_what_was_added() -> None:
             assert row.sigma == pytest.approx(np.sqrt(wanted), rel=0.15), row.name
 
 
+def test_a_calibration_that_went_on_from_the_other_shares_its_spots() -> None:
+    a, seen = cases.fewer_spots(), cases.first().inputs.observations
+    calibrator = lc.IncrementalCalibrator(a)
+    calibrator.add(seen[np.arange(len(seen)) % 3 == 0])
+    went_on = calibrator.calibration
+    assert went_on is not None
+    found, batch = lc.compare(a, went_on), lc.compare(a, cases.first())
+    assert found.inputs.shared == 60 and len(found.inputs.only_b) == 30
+    np.testing.assert_allclose(
+        [r.sigma for r in found.rows], [r.sigma for r in batch.rows], rtol=0.05
+    )
+
+
 def test_one_spot_more_can_make_a_difference_in_two_unknowns() -> None:
     b = cases.first()
     found = lc.compare(cases.calibrated(b.inputs.observations[1:]), b)
