@@ -136,21 +136,20 @@ def _is_ahead(
     quantities: Sequence[str],
     lowest: float,
 ) -> Finding | None:
-    """Compare means level by level."""
+    """Compare means level by level; None where one of the methods was not run."""
     places = [x for x, at in enumerate(curves.at) if at > 0 and at >= lowest]
 
     def was_run(method: str) -> bool:
         return method in curves.methods and bool(curves.asked[places, curves.row(method)].all())
 
-    there = [r for r in rivals if was_run(r)]
-    if not was_run(better) or not there or not places:
+    if not places or not all(map(was_run, (better, *rivals))):
         return None
     mean, error, b = curves.mean, curves.standard_error, curves.row(better)
     won, ratios, clearly_behind = 0, [], False
     for x in places:
         for quantity in quantities:
             q = QUANTITIES.index(quantity)
-            best = min((curves.row(r) for r in there), key=lambda m: _or_inf(mean[x, m, q]))
+            best = min((curves.row(r) for r in rivals), key=lambda m: _or_inf(mean[x, m, q]))
             ours, theirs = _or_inf(mean[x, b, q]), _or_inf(mean[x, best, q])
             ratios.append(ours / theirs if np.isfinite(theirs) else 0.0)
             won += ours < theirs
@@ -160,7 +159,7 @@ def _is_ahead(
         claim,
         True if won == len(ratios) else False if clearly_behind else None,
         f"ahead at {won} of {len(ratios)} points (levels x {', '.join(quantities)}); error "
-        f"{min(ratios):.2f} to {max(ratios):.2f} times the best of {', '.join(there)}",
+        f"{min(ratios):.2f} to {max(ratios):.2f} times the best of {', '.join(rivals)}",
     )
 
 

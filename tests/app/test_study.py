@@ -266,6 +266,12 @@ def test_behind_by_less_than_the_scatter_is_too_few_trials_to_say():
     assert holds(failed) is False
 
 
+def test_nothing_is_claimed_of_methods_that_were_not_run():
+    few = fig6_findings(curves_of([[[0.01, 0.02], [0.03, 0.04]]], (REFINED, "M2 Ma")))
+    claims = [f.claim for f in few if "reference" not in f.claim]
+    assert claims == ["the refined laser method is ahead of Ma's closed form"]
+
+
 def test_a_reason_covers_a_row_so_far_only():
     def finding(ratios):
         names = tuple(ratios)
