@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json
+from lasercal_gtsam.cli.pose_options import pose_options
 from lasercal_gtsam.cli.texts import count
-from lasercal_gtsam.cli.values import Names, Numbers, RotationName
+from lasercal_gtsam.cli.values import Names, Numbers
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.units import DEG_PER_RAD, M_PER_MM, MM_PER_M, RAD_PER_DEG
 
@@ -124,28 +125,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="The same seed gives the same plan.",
 )
-@click.option(
-    "--rotation",
-    type=RotationName(),
-    metavar="FORMAT",
-    default="quat_wxyz",
-    show_default=True,
-    help="How the hand's rotation is written: quat_xyzw, matrix, kuka, fanuc, ur, ...",
-)
-@click.option(
-    "--transform",
-    type=click.Choice(["T_base_hand", "T_hand_base"]),
-    default="T_base_hand",
-    show_default=True,
-    help="Which way round the poses are written.",
-)
-@click.option(
-    "--length",
-    type=click.Choice(["mm", "m"]),
-    default="mm",
-    show_default=True,
-    help="Unit of the positions.",
-)
+@pose_options
 @json_option
 def plan(
     cell: Path,

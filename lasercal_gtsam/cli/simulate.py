@@ -10,8 +10,9 @@ import click
 
 from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
 from lasercal_gtsam.cli.outputs import capture_folder
+from lasercal_gtsam.cli.pose_options import pose_options
 from lasercal_gtsam.cli.texts import count
-from lasercal_gtsam.cli.values import PresetName, RotationName
+from lasercal_gtsam.cli.values import PresetName
 from lasercal_gtsam.units import M_PER_MM, RAD_PER_DEG
 
 if TYPE_CHECKING:
@@ -71,28 +72,7 @@ class _WithPresets(click.Command):
 @click.option(
     "--hand-deg", metavar="DEG", type=_NOT_NEGATIVE, help="Sigma of its rotation, likewise."
 )
-@click.option(
-    "--rotation",
-    type=RotationName(),
-    metavar="FORMAT",
-    default="quat_wxyz",
-    show_default=True,
-    help="How the hand's rotation is written: quat_xyzw, matrix, kuka, fanuc, ur, ...",
-)
-@click.option(
-    "--transform",
-    type=click.Choice(["T_base_hand", "T_hand_base"]),
-    default="T_base_hand",
-    show_default=True,
-    help="Which way round the poses are written.",
-)
-@click.option(
-    "--length",
-    type=click.Choice(["mm", "m"]),
-    default="mm",
-    show_default=True,
-    help="Unit of the positions.",
-)
+@pose_options
 @click.option(
     "--pictures",
     is_flag=True,

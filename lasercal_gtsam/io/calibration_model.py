@@ -416,8 +416,8 @@ class CalibrationModel(CellModel):
             return
         used = np.array([spot.rejected is None for spot in self.spots], dtype=np.bool_)
         for kind in ("camera", "laser", "plane"):
-            named = set(getattr(observations, kind)[used].tolist())
-            if lost := sorted(named - set(getattr(cell, f"{kind}s"))):
+            there = set(getattr(observations, kind)[used].tolist())
+            if lost := sorted(there - set(getattr(cell, f"{kind}s"))):
                 yield f"inputs.observations.{kind}: {lost[0]!r:.60} is used, but not in the cell"
 
     def _spots(self) -> SpotResults:
