@@ -14,7 +14,7 @@ from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.io.files import read_bytes
 from lasercal_gtsam.io.pictures import Picture, decode_picture
 from lasercal_gtsam.io.wording import at_most, some
-from lasercal_gtsam.recordings.stamps import NS_PER_S, Stamps, as_stamps, ns_from_seconds
+from lasercal_gtsam.recordings.stamps import LATEST, NS_PER_S, Stamps, as_stamps, ns_from_seconds
 
 Naming = Literal["auto", "s", "ms", "us", "ns", "order"]
 _SUFFIXES = frozenset(
@@ -117,9 +117,14 @@ def _stamp_of(stem: str, naming: Naming) -> int | str:
             unit = _DIGITS[len(whole)]  # type: ignore[assignment]
         else:
             return f"{len(whole)} digits fit no stamp since 1970; say the unit (--names s|ms|us|ns)"
-    scaled = ns_from_seconds(stem)
-    assert scaled is not None
-    return scaled // _PER_S[unit] if "." in stem else int(whole) * (NS_PER_S // _PER_S[unit])
+    if "." in stem:
+        scaled = ns_from_seconds(stem)
+        stamp = None if scaled is None else scaled // _PER_S[unit]
+    else:
+        stamp = int(whole) * (NS_PER_S // _PER_S[unit])
+    if stamp is None or stamp > LATEST:
+        return "its name is no time that a clock shows"
+    return stamp
 
 
 def _in_order(

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 NS_PER_S = 1_000_000_000
-_LATEST = 2**63 - 1  # a clock counts nanoseconds in 64 bits: until the year 2262
+LATEST = 2**63 - 1  # a clock counts nanoseconds in 64 bits: until the year 2262
 Stamps = npt.NDArray[np.int64]
 
 
@@ -21,17 +21,17 @@ def ns_from_seconds(text: str) -> int | None:
         value = Decimal(text) if text.isascii() and "_" not in text else Decimal("nan")
     except InvalidOperation:
         return None
-    if not value.is_finite() or abs(value) > _LATEST // NS_PER_S:
+    if not value.is_finite() or abs(value) > Decimal(LATEST) / NS_PER_S:
         return None
     return int((value * NS_PER_S).to_integral_value())
 
 
 def ns_from_integer(text: str) -> int | None:
     """Nanoseconds written as a whole number; None if it is none that a clock shows."""
-    if not (text.isascii() and text.isdecimal() and len(text) <= len(str(_LATEST))):
+    if not (text.isascii() and text.isdecimal() and len(text) <= len(str(LATEST))):
         return None
     stamp = int(text)
-    return stamp if stamp <= _LATEST else None
+    return stamp if stamp <= LATEST else None
 
 
 def seconds_text(stamp: int) -> str:

@@ -261,7 +261,8 @@ def _one_above_several(
                 ours, theirs = _or_inf(alone.mean[y, m, 0]), _or_inf(curves.mean[x, n, 0])
                 doubt = np.hypot(alone.standard_error[y, m, 0], curves.standard_error[x, n, 0])
                 clearly_below |= bool(theirs - ours > 2.0 * doubt) or not np.isfinite(theirs)
-                pairs.append((ours / theirs if np.isfinite(theirs) else 0.0, at))
+                exact = theirs == 0.0  # without noise there is nothing to compare
+                pairs.append((1.0 if exact else ours / theirs if np.isfinite(theirs) else 0.0, at))
     above = sum(ratio > 1.0 for ratio, _ in pairs)
     low, at = min(pairs)
     return Finding(
