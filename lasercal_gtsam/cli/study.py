@@ -97,7 +97,7 @@ def _cell_options(function: F) -> F:
     return function
 
 
-@click.group(short_help="Repeat the paper's experiments, or run them for a cell of your own.")
+@click.group(short_help="Run the paper's experiments, there or in your own cell.")
 def study() -> None:
     """Simulate and solve many times: the paper's Fig. 6, Fig. 7 and Table 2.
 
