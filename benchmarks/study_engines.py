@@ -27,12 +27,11 @@ LEVELS = (0.2, 0.6, 1.0)
 
 
 def descendants() -> list[int]:
-    """Process numbers of everything below this process, youngest last."""
+    """Process numbers of everything below this process, whichever thread started it."""
     found, todo = [], [os.getpid()]
     while todo:
-        pid = todo.pop()
-        children = Path(f"/proc/{pid}/task/{pid}/children")
-        below = [int(x) for x in children.read_text().split()] if children.exists() else []
+        threads = Path(f"/proc/{todo.pop()}/task").glob("*/children")
+        below = [int(x) for children in threads for x in children.read_text().split()]
         found += below
         todo += below
     return found

@@ -87,8 +87,8 @@ def _array(*shape: int | None, largest: float = math.inf) -> Callable[[Any], Arr
             n not in (None, m) for n, m in zip(shape, array.shape, strict=True)
         ):
             raise ValueError(f"expected numbers of shape {wanted}, got shape {array.shape}")
-        if (np.abs(array) > largest).any():
-            raise ValueError(f"expected numbers up to {largest:g}, got {np.abs(array).max():g}")
+        if (size := np.abs(array[~np.isnan(array)])).size and size.max() > largest:
+            raise ValueError(f"expected numbers up to {largest:g}, got {size.max():g}")
         return array
 
     return convert

@@ -33,7 +33,7 @@ LARGEST_PLAUSIBLE_M, SMALLEST_PLAUSIBLE_M = 50.0, 0.01
 LARGEST_PLAUSIBLE_RAD = 4 * np.pi
 # No length, angle or pixel in any unit is larger; squares of such numbers can be added safely.
 LARGEST_NUMBER = 1e9
-SMALLEST_SIGMA_PX, LARGEST_CORRELATION = 1e-9, 1 - 1e-9
+SMALLEST_SIGMA_PX, LARGEST_SIGMA_PX, LARGEST_CORRELATION = 1e-9, 1e6, 1 - 1e-9
 
 
 @dataclass(frozen=True)
@@ -252,7 +252,7 @@ def _covariances(table: Table) -> Array:
         return cov
     if not table.require(["sigma_u", "sigma_v"], "a covariance needs both"):
         return cov
-    sigma = table.numbers(["sigma_u", "sigma_v"], allow_empty=True, largest=LARGEST_NUMBER)
+    sigma = table.numbers(["sigma_u", "sigma_v"], allow_empty=True, largest=LARGEST_SIGMA_PX)
     rho = np.zeros(len(table))
     if "rho_uv" in table.columns:
         rho = table.numbers(["rho_uv"], allow_empty=True)[:, 0]

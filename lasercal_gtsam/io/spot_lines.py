@@ -25,6 +25,7 @@ from lasercal_gtsam.io.capture_rows import (
     LARGEST_CORRELATION,
     LARGEST_NUMBER,
     LARGEST_PLAUSIBLE_M,
+    LARGEST_SIGMA_PX,
     OUTSIDE_TOLERANCE_PX,
     SMALLEST_SIGMA_PX,
     inverse_poses,
@@ -193,9 +194,8 @@ class SpotLines:
             cov = _numbers("cov_uv", data, (2, 2), "[[uu, uv], [uv, vv]] in px^2")
             least, product = np.diag(cov).min(), float(cov[0, 0] * cov[1, 1])
             symmetric = abs(cov[0, 1] - cov[1, 0]) <= 1e-9 * (cov[0, 0] + cov[1, 1])
-            apart = least >= SMALLEST_SIGMA_PX**2 and (
-                abs(cov[0, 1]) <= LARGEST_CORRELATION * math.sqrt(product)
-            )
+            inside = least >= SMALLEST_SIGMA_PX**2 and np.diag(cov).max() <= LARGEST_SIGMA_PX**2
+            apart = inside and (abs(cov[0, 1]) <= LARGEST_CORRELATION * math.sqrt(product))
             if not (symmetric and apart):
                 raise DataError(
                     f"cov_uv: expected a symmetric, positive definite matrix, got {cov.tolist()}"
@@ -207,6 +207,10 @@ class SpotLines:
             if sigma < SMALLEST_SIGMA_PX:
                 least = f"above 0 (at least {SMALLEST_SIGMA_PX:g})"
                 raise DataError(f"sigma_px: expected a number {least}, got {sigma:g}")
+            if sigma > LARGEST_SIGMA_PX:
+                raise DataError(
+                    f"sigma_px: expected a number up to {LARGEST_SIGMA_PX:g}, got {sigma:g}"
+                )
         return np.full((2, 2), np.nan) if sigma is None else sigma**2 * np.eye(2)
 
     def _pose(self, data: Mapping[str, Any]) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ def read_yaml(path: Path) -> tuple[Any, Lines, list[tuple[Location, str]]]:
 def parse_yaml(text: str, name: str) -> tuple[Any, Lines, list[tuple[Location, str]]]:
     """The same of a text; ``name`` is what messages call it."""
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+    from ruamel.yaml.error import MarkedYAMLError, ReusedAnchorWarning, YAMLError
     from ruamel.yaml.reader import ReaderError
 
     if len(text) > _MOST_CHARACTERS:
@@ -59,7 +60,9 @@ def parse_yaml(text: str, name: str) -> tuple[Any, Lines, list[tuple[Location, s
     try:
         reader = YAML(typ="safe", pure=True)
         reader.allow_duplicate_keys = True
-        node = reader.compose(text)
+        with warnings.catch_warnings():  # an anchor named twice is YAML: the later one counts
+            warnings.simplefilter("ignore", ReusedAnchorWarning)
+            node = reader.compose(text)
         if node is None:
             raise DataError(f"{name}: the file is empty")
         visit = _Visit(name)

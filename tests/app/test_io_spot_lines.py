@@ -162,3 +162,11 @@ def test_the_image_size_must_be_known_first():
         read(SPOT, lines)
     lines.image_size["camera"] = (640, 480)
     assert len(read(SPOT, lines)) == 1
+
+
+def test_sigmas_that_no_detector_has_are_refused():
+    reader = SpotLines(SIZES)
+    line = {"id": "a", "plane": "1", "uv": [1.0, 2.0], "T_base_hand": np.eye(4).tolist()}
+    for given in ({"sigma_px": 1e9}, {"cov_uv": [[1e13, 0.0], [0.0, 1.0]]}):
+        with pytest.raises(LineError, match=next(iter(given))):
+            reader.read(json.dumps({**line, **given}).encode())
