@@ -26,7 +26,7 @@ def _list_of_formats() -> str:
 
 
 @click.command(
-    short_help="Write a calibration for ROS, URDF, OpenCV, GTSAM, ...",
+    short_help="Write a calibration for ROS, URDF, OpenCV, GTSAM and more.",
     epilog=_list_of_formats(),
 )
 @click.argument("calibration", type=click.Path(path_type=Path))
