@@ -37,14 +37,15 @@ def check_calibration_target(path: Path) -> None:
 def check_target(path: Path, form: str, what: str) -> None:
     """Raise `DataError` where ``path`` cannot be written or holds anything but that ``format``."""
     check_writable(path)
-    if path.exists() and not _is_of(path, form):
+    if path.exists() and not is_of(path, form):
         raise DataError(
             f"{path}: there is a file that is not {what}, and it is left as it is; "
             "give another name with -o, or remove it"
         )
 
 
-def _is_of(path: Path, form: str) -> bool:
+def is_of(path: Path, form: str) -> bool:
+    """Whether a file states to be of that ``format``, or is empty."""
     try:
         content = path.read_bytes()
         data = json.loads(content) if content else {"format": form}  # an empty file loses nothing

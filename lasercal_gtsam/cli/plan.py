@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import click
 
 from lasercal_gtsam.cli.console import json_option, print_json
+from lasercal_gtsam.cli.outputs import is_of
 from lasercal_gtsam.cli.pose_options import pose_options
 from lasercal_gtsam.cli.texts import count
 from lasercal_gtsam.cli.values import Names, Numbers
@@ -204,14 +204,8 @@ def plan(
 def _read(path: Path) -> tuple[Cell, Calibration | None]:
     from lasercal_gtsam.io.calibration_file import FORMAT, load_calibration
     from lasercal_gtsam.io.cell_file import load_cell
-    from lasercal_gtsam.io.files import read_text
 
-    try:
-        data = json.loads(read_text(path))
-        is_calibration = isinstance(data, dict) and data.get("format") == FORMAT
-    except ValueError:
-        is_calibration = False
-    if is_calibration:
+    if is_of(path, FORMAT):
         calibration = load_calibration(path)
         return calibration.cell, calibration
     return load_cell(path), None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields
-from typing import Any
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from lasercal_gtsam.comparison.result import Change, InputsChange
 from lasercal_gtsam.figures.spots import rejected_spots
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.io.origin import Origin
-from lasercal_gtsam.io.plain import plain
+from lasercal_gtsam.io.plain import option_text
 from lasercal_gtsam.observations import Observations
 
 # of pixels and metres: far below what anybody measures, far above what arithmetic changes
@@ -63,7 +62,7 @@ def inputs_change(a: Calibration, b: Calibration, origins: tuple[Origin, Origin]
         same_pose=sum(_rounded(T) in poses_a for T in seen_b.T_base_hand[alone_b]),
         rejected=tuple(disputed),
         options=tuple(
-            Change(f.name, _text(x), _text(y))
+            Change(f.name, option_text(x), option_text(y))
             for f in fields(a.inputs.options)
             if (x := getattr(a.inputs.options, f.name)) != (y := getattr(b.inputs.options, f.name))
         ),
@@ -84,15 +83,3 @@ def _different(a: Mapping[str, str], b: Mapping[str, str]) -> list[Change]:
         for name in names
         if a.get(name, "") != b.get(name, "")
     ]
-
-
-def _text(value: Any) -> str:
-    """An option as a person writes it."""
-    value = plain(value)
-    if value is None or value in ([], {}):
-        return "none"
-    if isinstance(value, dict):
-        return ", ".join(f"{name} = {_text(item)}" for name, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
-    return f"{value:.12g}" if isinstance(value, float) else str(value)

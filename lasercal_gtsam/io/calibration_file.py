@@ -153,9 +153,14 @@ def _inputs(inputs: Inputs) -> dict[str, Any]:
 
 
 def program_version() -> str:
-    """Version of the installed package; "unknown" where it is not installed."""
+    """Version of this package; "unknown" where it is not installed."""
+    return package_version("lasercal-gtsam")
+
+
+def package_version(name: str) -> str:
+    """Version of an installed package; "unknown" where it is not installed."""
     try:
-        return metadata.version("lasercal-gtsam")
+        return metadata.version(name)
     except metadata.PackageNotFoundError:
         return "unknown"
 

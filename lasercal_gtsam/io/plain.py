@@ -47,6 +47,18 @@ def _is_plain(value: np.ndarray[Any, Any]) -> bool:
     return value.dtype.kind != "f" or bool(np.isfinite(value).all())
 
 
+def option_text(value: Any) -> str:
+    """An option as a person writes it."""
+    value = plain(value)
+    if value is None or value in ([], {}):
+        return "none"
+    if isinstance(value, dict):
+        return ", ".join(f"{name} = {option_text(item)}" for name, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(option_text(item) for item in value)
+    return f"{value:.12g}" if isinstance(value, float) else str(value)
+
+
 def pose_to_dict(T: Array) -> dict[str, Any]:
     """A transform as translation (m) and quaternion for readers, and as the exact matrix."""
     return {

@@ -6,11 +6,10 @@ import platform
 import shlex
 from collections.abc import Iterator
 from dataclasses import fields
-from importlib import metadata
 from typing import Any
 
-from lasercal_gtsam.io.calibration_file import inputs_digest
-from lasercal_gtsam.io.plain import plain
+from lasercal_gtsam.io.calibration_file import inputs_digest, package_version
+from lasercal_gtsam.io.plain import option_text
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.report.material import Material
 
@@ -50,12 +49,12 @@ def inputs_section(material: Material) -> dict[str, Any]:
         "versions": {
             "python": platform.python_version(),
             "platform": platform.platform(terse=True),
-            **{name: _version(name) for name in _PACKAGES},
+            **{name: package_version(name) for name in _PACKAGES},
         },
         "options": [
             {
                 "name": f.name,
-                "value": _text(getattr(options, f.name)),
+                "value": option_text(getattr(options, f.name)),
                 "words": _OPTIONS.get(f.name, ""),
             }
             for f in fields(options)
@@ -63,25 +62,6 @@ def inputs_section(material: Material) -> dict[str, Any]:
         "commands": list(_commands(material)),
         "n_spots": len(calibration.inputs.observations),
     }
-
-
-def _version(name: str) -> str:
-    try:
-        return metadata.version(name)
-    except metadata.PackageNotFoundError:
-        return "unknown"
-
-
-def _text(value: Any) -> str:
-    """An option as a person writes it."""
-    value = plain(value)
-    if value is None or value in ([], {}):
-        return "none"
-    if isinstance(value, dict):
-        return ", ".join(f"{name} = {_text(item)}" for name, item in value.items())
-    if isinstance(value, list):
-        return ", ".join(_text(item) for item in value)
-    return f"{value:.12g}" if isinstance(value, float) else str(value)
 
 
 def _commands(material: Material) -> Iterator[dict[str, str]]:

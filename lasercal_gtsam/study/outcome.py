@@ -107,9 +107,9 @@ class ErrorCurves(FrozenData):
                 self.axis: at,
                 "method": method,
                 "quantity": quantity,
-                "mean": _finite(mean[x, m, q]),
-                "standard_error": _finite(error[x, m, q]),
-                "median": _finite(median[x, m, q]),
+                "mean": finite_or_none(mean[x, m, q]),
+                "standard_error": finite_or_none(error[x, m, q]),
+                "median": finite_or_none(median[x, m, q]),
                 "failed": int(failures[x, m]),
                 "trials": self.trials,
             }
@@ -155,5 +155,6 @@ def _percent(value: float) -> str:
     return "0" if value < 1e-9 else f"{100 * value:.3g}"
 
 
-def _finite(value: float) -> float | None:
+def finite_or_none(value: float) -> float | None:
+    """The number; None, for JSON, where it is none."""
     return float(value) if np.isfinite(value) else None

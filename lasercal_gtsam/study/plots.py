@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.plot.style import PARTS, new_figure
 from lasercal_gtsam.study.errors import QUANTITIES
 from lasercal_gtsam.study.fig6_runs import HORAUD
 from lasercal_gtsam.study.outcome import ErrorCurves
@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Okabe and Ito's colours: told apart by colour-blind eyes; a family of methods shares one
-_FAMILIES = {"M1": "#0072b2", "M2": "#d55e00", "M3": "#009e73", "M4": "#cc79a7"}
-_CASES = ("#0072b2", "#56b4e9", "#d55e00", "#009e73")
+# a family of methods shares a colour, and so do the cases of one plane, nearly
+_FAMILIES = dict(zip(("M1", "M2", "M3", "M4"), PARTS, strict=False))
+_CASES = (PARTS[0], PARTS[5], PARTS[1], PARTS[2])
 _LABELS = {"f_u": "error of $f_u$ (%)", "R": "error of $R$ (%)", "T": "error of $T$ (%)"}
 _STYLES = ("-", "--", ":", "-.")
 _MARKERS = "os^Dv*P"
@@ -34,18 +34,14 @@ def figure_of(study: Study) -> Figure:
     DataError
         Matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise DataError("figures need Matplotlib: pip install 'lasercal-gtsam[report]'") from None
     if study.name == "fig6":
-        figure = Figure(figsize=(13.0, 4.6), layout="constrained")
+        figure = new_figure(13.0, 4.6)
         _draw_fig6(figure, study.curves["fig6"])
     elif study.name == "fig7":
-        figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+        figure = new_figure(11.0, 4.6)
         _draw_fig7(figure, list(study.curves.values()))
     else:
-        figure = Figure(figsize=(9.0, 5.5), layout="constrained")
+        figure = new_figure(9.0, 5.5)
         _draw_table2(figure.subplots(), study.columns)
     return figure
 

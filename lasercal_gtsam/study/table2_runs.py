@@ -21,6 +21,7 @@ from lasercal_gtsam.report_map import BeamChart, row_names, row_values
 from lasercal_gtsam.simulate import Noise
 from lasercal_gtsam.study.cells import StudyCell
 from lasercal_gtsam.study.fig6_runs import trial_seed
+from lasercal_gtsam.study.outcome import finite_or_none
 from lasercal_gtsam.study.printed import PRINTED_SIGMAS
 
 TRIALS = 60
@@ -63,7 +64,8 @@ def table2_run(spec: Mapping[str, Any], k: int) -> dict[str, Any]:
     names = [name for name, _ in row_names(found.cell, charts)]
     truth = dict(zip(names, row_values(made.truth, charts).tolist(), strict=True))
     rows = {
-        p.name: [truth[p.name], _or_none(p.initial), p.refined, p.sigma] for p in found.parameters
+        p.name: [truth[p.name], finite_or_none(p.initial), p.refined, p.sigma]
+        for p in found.parameters
     }
     return {"rows": rows, "rms_px": found.fit.rms_px}
 
@@ -183,7 +185,3 @@ def _number(value: float, short: bool) -> str:
     if not np.isfinite(value):
         return ""
     return f"{value:.3g}" if short else f"{value:.5g}"
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
