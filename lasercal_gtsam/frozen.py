@@ -13,6 +13,9 @@ from lasercal_gtsam.errors import DataError
 
 Array = npt.NDArray[np.float64]
 
+LARGEST = 1e12
+"""No pixel and no length in metres is larger; squares of such numbers can be added safely."""
+
 
 class FrozenData:
     """Base for frozen dataclasses that hold arrays: value equality over all fields."""
@@ -51,18 +54,23 @@ def _equal(a: Any, b: Any) -> bool:
 
 
 def set_array(
-    owner: object, name: str, value: Any, shape: tuple[int | None, ...], finite: bool = True
+    owner: object,
+    name: str,
+    value: Any,
+    shape: tuple[int | None, ...],
+    finite: bool = True,
+    largest: float = np.inf,
 ) -> Array:
     """Store ``value`` on a frozen dataclass as a read-only float64 array of the given shape.
 
-    ``None`` in ``shape`` stands for any length. Raises `DataError` naming the field, what was
-    found and what was expected.
+    ``None`` in ``shape`` stands for any length; no number may be larger than ``largest``. Raises
+    `DataError` naming the field, what was found and what was expected.
     """
     where = f"{type(owner).__name__}.{name}"
     wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where}: expected numbers of shape {wanted}, got {value!r}") from error
     matches = array.ndim == len(shape) and all(
         n is None or n == m for n, m in zip(shape, array.shape, strict=True)
@@ -72,6 +80,11 @@ def set_array(
     if finite and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise DataError(f"{where}: expected finite numbers, got {array[index]} at index {index}")
+    if (too_large := np.abs(array) > largest).any():
+        index = tuple(int(i) for i in np.argwhere(too_large)[0])
+        raise DataError(
+            f"{where}: expected numbers up to {largest:g}, got {array[index]:g} at index {index}"
+        )
     array.flags.writeable = False
     object.__setattr__(owner, name, array)
     return array

@@ -265,28 +265,28 @@ def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFac
 
     def error(values: Any) -> Array:
         z = values.atVector(CELL_KEY)
-        state = chart.state(z)
+        K = chart.intrinsics(z)
         e = np.full(len(holds.priors), np.inf)
-        if not np.all(state.cam_K[:, :2] > 0):
+        if not np.all(K[:, :2] > 0):
             return e
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
             if name in rows:
                 e[r] = rows[name].difference(rows[name].value(z), mean) / sigma
             else:
-                fu, fv = state.cam_K[aspects[name], :2]
+                fu, fv = K[aspects[name], :2]
                 e[r] = np.log(fu / fv / mean) * mean / sigma
         return e
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         z = values.atVector(CELL_KEY)
-        state = chart.state(z)
+        K = chart.intrinsics(z)
         J = np.zeros((len(holds.priors), chart.n))
         for r, (name, (mean, sigma)) in enumerate(holds.priors.items()):
             if name in rows:
                 J[r] = rows[name].gradient(z) / sigma
             else:
                 at = focal[aspects[name]]
-                fu, fv = state.cam_K[aspects[name], :2]
+                fu, fv = K[aspects[name], :2]
                 J[r, at : at + 2] = mean / sigma * np.array([1 / fu, -1 / fv])
         for at, aspect in zip(focal, chart.aspects, strict=True):
             if aspect is not None:

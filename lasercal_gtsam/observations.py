@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from lasercal_gtsam.cell import check_image_size, check_pose
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.frozen import Array, FrozenData, set_array
+from lasercal_gtsam.frozen import LARGEST, Array, FrozenData, set_array
 
 Names = npt.NDArray[np.str_]
 Index = npt.NDArray[np.int64]
@@ -59,8 +59,9 @@ class Observations(FrozenData):
     stop: Names | None = None
 
     def __post_init__(self) -> None:
-        n = len(set_array(self, "uv", self.uv, (None, 2)))
-        check_pose(set_array(self, "T_base_hand", self.T_base_hand, (n, 4, 4)), "T_base_hand")
+        n = len(set_array(self, "uv", self.uv, (None, 2), largest=LARGEST))
+        T = set_array(self, "T_base_hand", self.T_base_hand, (n, 4, 4), largest=LARGEST)
+        check_pose(T, "T_base_hand")
         cov = set_array(self, "cov_uv", self.cov_uv, (n, 2, 2), finite=False)
         _check_covariances(cov)
         for name in ("camera", "laser", "plane", "id", "stop"):

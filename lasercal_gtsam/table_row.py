@@ -117,7 +117,7 @@ class _IntrinsicRow(TableRow):
 
     def value(self, z: Array) -> float:
         index = self.index - CAMERA_TANGENT.index("fu")
-        return float(self.chart.state(z).cam_K[self.part, index])
+        return float(self.chart.intrinsics(z)[self.part, index])
 
     def gradient(self, z: Array) -> Array:
         out = np.zeros(self.chart.n)

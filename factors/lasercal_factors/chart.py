@@ -60,6 +60,14 @@ class CellChart:
         state: State = chart_kernels.move(z, self.aspect_array, self.reference)
         return state
 
+    def intrinsics(self, z: Array) -> Array:
+        """``cam_K`` (C, 9) of `state`, without the rest of it."""
+        coordinates = z[: CAMERA_DIM * len(self.reference.cam_R)].reshape(-1, CAMERA_DIM)
+        K: Array = self.reference.cam_K + coordinates[:, CAMERA_DIM - 9 :]
+        tied = ~np.isnan(self.aspect_array)
+        K[tied, 0] = self.aspect_array[tied] * K[tied, 1]
+        return K
+
     def tangent_map(self, z: Array) -> Array:
         """(n, n): a step in ``z`` to the step in the tangent coordinates of the state at ``z``.
 

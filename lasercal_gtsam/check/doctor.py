@@ -27,7 +27,7 @@ _MOST_SPOTS = 300
 # where even the best leaves too much at first sight, this many are solved: nobody can say why
 _KEPT = 12
 _MOST_REFINED = 5
-_MOST_RETRIED = 2
+_MOST_RETRIED = 1
 # share of the spots that fit a reading if there are no outliers
 _NEARLY_ALL = 0.95
 
@@ -94,7 +94,7 @@ def _limit_px(solved: Mapping[int, Solved]) -> float:
 
 
 def _next_best(solved: Mapping[int, Solved], poses: int) -> list[int]:
-    """The declared trial (0), and the best of the other readings of the poses."""
+    """The declared trial (0), and the best other reading of the poses."""
     ranked = sorted((k for k in solved if 0 < k < poses), key=lambda k: solved[k].residual_px)
     return [0, *ranked[:_MOST_RETRIED]]
 

@@ -30,7 +30,7 @@ from lasercal_gtsam.calibration import (
 )
 from lasercal_gtsam.cell import ROTATION_TOLERANCE, Beam, Camera, Cell, Intrinsics, Plane
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.frozen import LARGEST, Array
 from lasercal_gtsam.io.conventions import rotations_from_columns
 from lasercal_gtsam.io.wording import did_you_mean
 from lasercal_gtsam.observations import Observations
@@ -42,8 +42,8 @@ from lasercal_gtsam.rotations import make_pose
 # orthonormal to the last digit, the quaternion's always is.
 POSE_AGREEMENT = 10 * ROTATION_TOLERANCE
 
-# Of a length in metres, a pixel, a coefficient, a sigma: larger ones mean nothing, smaller are 0.
-LARGEST, SMALLEST = 1e12, 1e-100
+# A pixel, a length or a coefficient that is smaller is 0: its square would be.
+_SMALLEST = 1e-100
 
 _LARGEST_WHOLE = 10**300  # more do not fit into a float
 
@@ -62,13 +62,10 @@ def _number(value: Any) -> Any:
 
 
 def _ordinary(value: float) -> float:
-    """A number that can be squared and divided by; or NaN, where nothing is known."""
-    size = abs(value)
-    if size > LARGEST or 0 < size < SMALLEST:
-        raise ValueError(
-            f"expected 0 or a number between {SMALLEST:g} and {LARGEST:g} in size, got {value:g}"
-        )
-    return value
+    """A number that can be squared, and divided by unless it is 0; or NaN: nothing is known."""
+    if abs(value) > LARGEST:
+        raise ValueError(f"expected a number up to {LARGEST:g} in size, got {value:g}")
+    return 0.0 if abs(value) < _SMALLEST else value
 
 
 def _array(*shape: int | None, largest: float = math.inf) -> Callable[[Any], Array]:

@@ -303,7 +303,7 @@ def observations_from(payload: Mapping[str, Any]) -> Observations:
             stop=payload.get("stop"),
             **{name: payload[name] for name in ("camera", "laser", "plane", "id")},
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"these are no spots: {type(error).__name__}: {error}") from None
 
 

@@ -15,7 +15,7 @@ from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array, FrozenData
 from lasercal_gtsam.observability import plausible_ranges
 from lasercal_gtsam.observations import Names, Observations
-from lasercal_gtsam.options import DISTORTION_NAMES
+from lasercal_gtsam.options import DISTORTION_NAMES, LARGEST_SIGMA
 from lasercal_gtsam.plan.candidates import candidate_poses
 from lasercal_gtsam.plan.design import Problem, choose, covariance_of
 from lasercal_gtsam.plan.limits import Limits
@@ -28,6 +28,8 @@ from lasercal_gtsam.simulate.streams import MOTIONS, stream
 
 SHOTS = 10
 _ROTATIONS, _SHOTS_OF_ROTATION = 4, 120
+# no detector is better, and with less the prior of a few poses is lost in rounding
+_SMALLEST_SIGMA_PX = 1e-3
 # a direction whose variance is below this share of its coordinates' is held by a constraint
 _HELD_VARIANCE = 1e-12
 # the one-plane calibration holds these, as the paper does
@@ -228,6 +230,7 @@ def procedure(
     """
     if groups < 1:
         raise DataError(f"plan: groups: expected an integer >= 1, got {groups}")
+    _check_sigma(sigma_px)
     problem, limits = _problem(cell, camera, laser, planes, limits, distortion)
     design = MotionDesign(
         beam_length=limits.beam_length,
@@ -307,6 +310,14 @@ def _uncertain_directions(covariance: Array) -> tuple[Array, Array]:
     return scale[:, None] * vectors[:, uncertain], variances[uncertain]
 
 
+def _check_sigma(sigma_px: float) -> None:
+    if not _SMALLEST_SIGMA_PX <= sigma_px <= LARGEST_SIGMA:  # nor NaN
+        raise DataError(
+            f"plan: sigma_px: expected pixels from {_SMALLEST_SIGMA_PX:g} to {LARGEST_SIGMA:g}, "
+            f"got {sigma_px!r}"
+        )
+
+
 def _chosen(
     problem: Problem,
     limits: Limits,
@@ -320,8 +331,7 @@ def _chosen(
     for what, value in (("count", count), ("rotations", rotations)):
         if isinstance(value, bool) or not isinstance(value, int) or value < 1:
             raise DataError(f"plan: {what}: expected an integer >= 1, got {value!r}")
-    if not (np.isfinite(sigma_px) and sigma_px > 0):
-        raise DataError(f"plan: sigma_px: expected a number > 0, got {sigma_px!r}")
+    _check_sigma(sigma_px)
     T, planes = candidate_poses(
         problem.cell,
         problem.camera,

@@ -20,6 +20,9 @@ Parts = Iterator[tuple[Cell, int] | None]
 _FEWEST, _CONFIDENCE = 15, 0.99
 # how many at least while no fit is credible: its residuals say nothing about the share of outliers
 _FEWEST_LOST = 30
+# where a part has this share of the spots or more, only a lonely outlier can be outside of it: then
+# as many parts as leave out every spot so many times
+_LARGE, _TIMES_LEFT_OUT = 2 / 3, 2
 # parts that lead to the same end, so that fewer are enough
 _AGREED = 2
 # parts refused one after the other after which the data are at fault, not their outliers
@@ -52,6 +55,14 @@ def best_of_parts(search: Search, parts: Parts, best: Consensus | None) -> Conse
             break
         clean = float(np.clip(best.share**size, 1e-12, 1.0 - 1e-12))
         least = _FEWEST if credible(search, best.scale) else _FEWEST_LOST
-        if trial >= max(least, np.log(1.0 - _CONFIDENCE) / np.log1p(-clean)):
+        enough = max(least, np.log(1.0 - _CONFIDENCE) / np.log1p(-clean))
+        if trial >= min(enough, _most(len(search.batch), size)):
             break
     return best
+
+
+def _most(count: int, size: int) -> float:
+    """How many parts of ``size`` of ``count`` spots are worth trying at most."""
+    if size < _LARGE * count:
+        return np.inf
+    return _TIMES_LEFT_OUT * count / max(count - size, 1)

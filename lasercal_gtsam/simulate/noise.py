@@ -8,6 +8,7 @@ import numpy as np
 
 from lasercal_gtsam.errors import DataError
 from lasercal_gtsam.frozen import Array
+from lasercal_gtsam.options import LARGEST_SIGMA
 from lasercal_gtsam.rotations import rotation_exp
 from lasercal_gtsam.units import M_PER_MM, RAD_PER_DEG
 
@@ -30,8 +31,10 @@ class Noise:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if not (np.isfinite(value) and value >= 0):
-                raise DataError(f"Noise.{f.name}: expected a number >= 0, got {value!r}")
+            if not 0 <= value <= LARGEST_SIGMA:  # nor NaN
+                raise DataError(
+                    f"Noise.{f.name}: expected a number from 0 to {LARGEST_SIGMA:g}, got {value!r}"
+                )
             object.__setattr__(self, f.name, float(value))
 
     @classmethod

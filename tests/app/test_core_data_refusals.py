@@ -228,6 +228,10 @@ def test_arrays_are_read_only_copies():
     [
         ({"uv": np.zeros((4, 3))}, r"Observations\.uv: expected shape \(N, 2\), got \(4, 3\)"),
         ({"uv": np.full((4, 2), np.nan)}, r"Observations\.uv: expected finite numbers, got nan"),
+        (
+            {"uv": np.full((4, 2), 1e300)},
+            r"uv: expected numbers up to 1e\+12, got 1e\+300 at index",
+        ),
         ({"T_base_hand": np.eye(4)}, r"Observations\.T_base_hand: expected shape \(4, 4, 4\)"),
         (
             {"T_base_hand": np.stack([np.eye(4)] * 2 + [mirrored()] + [np.eye(4)])},

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 
 import numpy as np
 import pytest
 from core_cases import distance_in_sigmas, simulated
 
 import lasercal_gtsam as lc
+from lasercal_gtsam.random_parts import parts_of
 from lasercal_gtsam.robust import FALSE_ALARM, rejection_length, robust_scale
 from lasercal_gtsam.simulate import Noise, simulate
 
@@ -27,6 +29,24 @@ def spoiled(observations, wrong, how="anywhere", seed=0):
 def choose(count, share, seed):
     number = max(1, round(share * count))
     return np.sort(np.random.default_rng(100 + seed).choice(count, number, replace=False))
+
+
+def test_parts_of_few_spots_leave_out_every_spot_equally_often():
+    """So a lonely outlier is outside of some part, however few spots there are."""
+    simulation = simulate("paper-1", 0, groups=3, shots=4)
+    seen = []
+
+    def closed_form(part):
+        seen.append(part.id)
+        return simulation.truth
+
+    sizes = [size for _, size in islice(parts_of(simulation.observations, closed_form, 0), 12)]
+    assert sizes == [10] * 12
+    for first in (0, 6):
+        inside = np.concatenate(seen[first : first + 6])
+        names, times = np.unique(inside, return_counts=True)
+        assert len(names) == 12
+        assert set(times) == {5}
 
 
 def without(observations, wrong):

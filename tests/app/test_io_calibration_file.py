@@ -326,6 +326,17 @@ def test_values_that_make_no_cell_all_at_once(saved: tuple[Path, dict]) -> None:
     ]
 
 
+def test_numbers_whose_squares_are_none(saved: tuple[Path, dict]) -> None:
+    path, data = saved
+    intrinsics = data["cameras"]["camera"]["intrinsics"]
+    intrinsics["u0"] = 1e-300
+    path.write_text(json.dumps(data))
+    assert load_calibration(path).cell.cameras["camera"].intrinsics.u0 == 0.0
+    intrinsics["u0"] = 1e300
+    path.write_text(json.dumps(data))
+    assert "cameras.camera.intrinsics.u0: expected a number up to 1e+12" in refusal(path)[0]
+
+
 def test_unknown_option(saved: tuple[Path, dict]) -> None:
     path, data = saved
     data["inputs"]["options"]["sigma_pix"] = 1.0

@@ -21,6 +21,7 @@ from hypothesis import strategies as st
 from journal_child import payload_of
 
 from lasercal_gtsam.errors import DataError
+from lasercal_gtsam.frozen import LARGEST
 from lasercal_gtsam.io import journal as module
 from lasercal_gtsam.io.journal import (
     Damage,
@@ -708,7 +709,7 @@ def test_a_line_that_is_completed_while_it_is_read(path: Path) -> None:
 TEXT = st.text(st.characters(exclude_categories=()), max_size=8).filter(
     lambda text: not text.endswith("\0")  # numpy strings cannot end so
 )
-NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+NUMBER = st.floats(-LARGEST, LARGEST)
 VARIANCE = st.floats(1e-150, 1e150)
 
 
@@ -768,6 +769,8 @@ def test_observations_come_back_to_the_last_bit(
         ({"uv": None}, "these are no spots"),
         ({"uv": [[1.0, 2.0], [3.0, 4.0]]}, "these are no spots"),
         ({"id": 7}, "these are no spots"),
+        ({"uv": [[10**400, 2.0]]}, "these are no spots"),
+        ({"uv": [[1e300, 2.0]]}, "expected numbers up to 1e"),
         ({"image_size": {}}, "no size given for camera"),
         ({"T_base_hand": [[1.0] * 16]}, "expected a rigid transform"),
     ],

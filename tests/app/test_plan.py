@@ -269,7 +269,9 @@ def test_hands_go_a_short_way(forty):
         ({"limits": Limits(box=((5, 5, 5), (6, 6, 6)))}, "meets plane '1' nowhere"),
         ({"count": 0}, "count: expected an integer >= 1"),
         ({"count": 100_000}, "are possible within the limits, 100000 are asked for"),
-        ({"sigma_px": 0.0}, "sigma_px: expected a number > 0"),
+        ({"sigma_px": 0.0}, "sigma_px: expected pixels from 0.001"),
+        ({"sigma_px": 1e-300}, "sigma_px: expected pixels from 0.001"),
+        ({"sigma_px": float("nan")}, "sigma_px: expected pixels from 0.001"),
         ({"camera": "left"}, "'left' is not among them"),
     ],
 )

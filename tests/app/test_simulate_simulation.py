@@ -227,6 +227,7 @@ def test_any_cell_any_part():
         (lambda: simulate_cell(paper_cell(2), groups={"1": 2}), "no number of groups.*'2'"),
         (lambda: Noise(pixel_px=-1), "pixel_px"),
         (lambda: Noise(hand_rotation_rad=float("nan")), "hand_rotation_rad"),
+        (lambda: Noise(hand_rotation_rad=1e306), "hand_rotation_rad: expected a number from 0"),
         (lambda: simulate(noise=Noise(hand_translation_m=10.0)), "give less noise"),
         (lambda: paper_cell(4), "planes"),
     ],

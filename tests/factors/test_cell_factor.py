@@ -66,6 +66,12 @@ def test_same_error_as_the_natural_variables_anywhere(scene: Scene) -> None:
         assert cell_factor.error(vector_values(z)) == pytest.approx(expected, rel=1e-10)
 
 
+@pytest.mark.parametrize("aspect", [None, 1.01])
+def test_intrinsics_alone_are_those_of_the_state(scene: Scene, aspect: float | None) -> None:
+    chart, z = chart_of(scene, aspect), random_step(np.random.default_rng(3), 1.0)
+    np.testing.assert_array_equal(chart.intrinsics(z), chart.state(z).cam_K)
+
+
 def test_jacobian_far_from_the_reference(scene: Scene) -> None:
     chart = chart_of(scene)
     z = random_step(np.random.default_rng(4), 1.0)

@@ -29,6 +29,9 @@ _FIRST = (
     ("check", "two"),
     ("judge", "two/calibration.json"),
     ("update", "spots/calibration.json", "more", "-o", "first.json"),
+    ("report", "spots/calibration.json", "-o", "first.html"),
+    ("compare", "spots/calibration.json", "two/calibration.json", "-o", "first.html"),
+    ("plan", "spots/truth.json", "-n", "4"),
 )
 
 
@@ -335,6 +338,32 @@ def export(rng: Random, corpus: Corpus) -> Input:
     return Input("export", args, {name: spoil_json(rng, corpus[name])}, results=("out.x",))
 
 
+def pages(rng: Random, corpus: Corpus) -> Input:
+    """What is written about a calibration: report, comparison, figures."""
+    name = rng.choice(("spots/calibration.json", "two/calibration.json"))
+    files = {name: spoil_json(rng, corpus[name])}
+    figure = rng.choice(("residuals", "coverage", "error-map", "correlation", "cell"))
+    both = rng.sample([name, "spots/calibration.json"], 2)
+    kind, *args, output = rng.choice(
+        (
+            ("report", name, "page.html"),
+            ("compare", *both, "page.html"),
+            ("compare", *both, "page.html"),
+            ("plot", name, figure, "page.png"),
+        )
+    )
+    return Input(kind, (kind, *args, "-o", output), files, results=(output,))
+
+
+def plan(rng: Random, corpus: Corpus) -> Input:
+    if rng.random() < 0.5:
+        name = "spots/truth.json"
+        return Input("plan", ("plan", name, "-n", "4"), {name: _json_of(rng, corpus[name], b"{}")})
+    word = token(rng).replace("\0", "")
+    option = rng.choice((*_PLAN, "--rotation", "--planes", "--camera"))
+    return Input("plan", ("plan", "spots/truth.json", "-n", "4", f"{option}={word}"), {})
+
+
 def recording(rng: Random, corpus: Corpus) -> Input:
     if rng.random() < 0.7:
         files = {"poses.tum": spoil_bytes(rng, corpus["poses.tum"])}
@@ -380,6 +409,7 @@ _SETTINGS = ("channel", "ambiguous_ratio", "saturation_level", "region", "thresh
 _WATCH = ("--max-spots", "--half-life", "--interval", "--until-idle", "--reset", "--journal")
 _SIMULATE = ("--preset", "--seed", "--rotation", "--length", "--bits", "--ambient", "--transform")
 _NOISE = ("--noise", "--pixel-px", "--hand-mm", "--hand-deg")
+_PLAN = ("--beam-mm", "--box-mm", "--reach-mm", "--cone-deg", "--roll-deg", "--sigma-px")
 _COMMANDS = ("calibrate", "check", "update", "detect", "history", "simulate", "judge", "watch")
 
 KINDS: Mapping[Callable[[Random, Corpus], Input], float] = {
@@ -399,6 +429,8 @@ KINDS: Mapping[Callable[[Random, Corpus], Input], float] = {
     lens: 4,
     export: 3,
     recording: 4,
+    pages: 0.6,
+    plan: 0.3,
 }
 
 

@@ -24,7 +24,7 @@ _LINE = re.compile(r"(Error|Warning|Usage|Try|Traceback|Interrupted|Going on|End
 # what `judge` and `watch` say in other words
 _VERDICT = re.compile(r"Verdict: bad|ALARM open")
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
-_NOT_A_NUMBER = re.compile(r"(?<![\w/.-])[-+]?(nan|inf)(?![\w/.-])", re.IGNORECASE)
+_NOT_A_NUMBER = re.compile(r"(?<![\w/.'-])(?<!plane )[-+]?(nan|inf)(?![\w/.'-])", re.IGNORECASE)
 
 
 class Hang(BaseException):
@@ -112,7 +112,9 @@ def run(args: Sequence[str], stdin: bytes = b"", limit_s: float = LIMIT_S) -> Ou
     outcome = Outcome(status, _streams.written(1), _streams.written(2), seconds, cpu, faults, trace)
     for w in caught:
         where = f"{Path(w.filename).name}:{w.lineno}"
-        faults.append(f"warning: {w.category.__name__}: {w.message} ({where})"[:300])
+        fault = f"warning: {w.category.__name__}: {w.message} ({where})"[:300]
+        if fault not in faults:
+            faults.append(fault)
     if not trace:
         faults += _words(outcome)
     return outcome
@@ -161,7 +163,18 @@ def _words(outcome: Outcome) -> Iterator[str]:
 
 
 def _not_numbers(out: str) -> Iterator[str]:
-    """NaN and infinity have no place in an answer, neither in a table nor in JSON."""
+    """NaN and infinity have no place in an answer, neither in a table nor (but as words) in JSON.
+
+    "inf" as the name of a plane is none.
+    """
+    try:
+        json.loads(out, parse_constant=_refuse)
+        return
+    except json.JSONDecodeError:  # a table, or several documents
+        pass
+    except ValueError as error:
+        yield f"stdout: {error}"[:200]
+        return
     for line in out.splitlines():
         if line.startswith("{") and line.endswith("}"):
             try:
