@@ -77,7 +77,9 @@ class RangeSvd:
         ``sigma`` multiplies the pixel sigmas that ``R`` was whitened with.
         """
         found: list[WeakDirection] = []
-        for strength, move in zip(self.values[::-1] / sigma, self.directions[::-1], strict=True):
+        with np.errstate(divide="ignore", invalid="ignore"):  # no noise at all
+            strengths = np.where(self.values > 0.0, self.values / sigma, 0.0)
+        for strength, move in zip(strengths[::-1], self.directions[::-1], strict=True):
             if strength >= threshold:
                 break
             top = np.flatnonzero(np.abs(move) >= _NAMED_SHARE * np.abs(move).max())

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from lasercal_gtsam.errors import DataError, LasercalError
 from lasercal_gtsam.incremental.calibrator import IncrementalCalibrator
+from lasercal_gtsam.incremental.parts import KINDS
 from lasercal_gtsam.io.calibration_file import load_calibration
 from lasercal_gtsam.io.files import read_bytes, sha256_of, write_bytes
 from lasercal_gtsam.io.journal import Journal, JournalReader, observations_from, spots_payload
@@ -123,6 +124,11 @@ class JournaledCalibrator:
             except LasercalError:
                 return  # said when it came
         elif kind in (RESET, DISMISS):
+            if not all(k in KINDS and isinstance(name, str) for k, name in payload.items()):
+                raise DataError(
+                    f"{self.path}: record {seq} is a {kind!r} with {dict(payload)!r:.60}; expected "
+                    f"the names of parts ({', '.join(KINDS)})"
+                )
             try:
                 self._do(kind, payload)
             except LasercalError:
@@ -240,7 +246,9 @@ class _About:
             what = "without a calibration" if begun is None else "with another calibration"
             problems.append(f"it was begun {what} than {self.start}")
         elif begun is None:
-            problems += _differences(about.get("options") or {}, plain(self.options))
+            before = about.get("options")
+            before = before if isinstance(before, Mapping) else {}
+            problems += _differences(before, plain(self.options))
         if problems:
             raise DataError(
                 *(f"{path}: this journal was begun another way: {text}" for text in problems),

@@ -133,7 +133,7 @@ def calibration_of(
         f"the spots do not determine this combination: {w.words}"
         for w in svd.weak_directions(SINGULAR, sigma=estimate.sigma0)
     ]
-    troubles = [*account.troubles, *undetermined]
+    troubles = [*account.troubles, *undetermined, *_impossible(residuals[used])]
     fit = _fit(estimate, account, troubles, residuals[used], int((~used).sum()), unit)
     notes = [*fold_warnings(cell), *report_notes(cell, uncertainty)]
     if account.older:
@@ -203,6 +203,17 @@ def _batch(spots: Observations, cell: Cell, account: Account) -> SpotBatch:
     return corrected_batch(spots, cov, cell, noise, eta)
 
 
+def _impossible(residuals: Array) -> list[str]:
+    """A sentence if used spots cannot be, as the hand was commanded; noise may have moved it."""
+    count = int((~np.isfinite(residuals).all(axis=1)).sum())
+    if not count:
+        return []
+    return [
+        f"{count} of {len(residuals)} spots that count cannot be where the hand was (beam away "
+        "from its plane, behind the camera, or in the fold of the distortion)"
+    ]
+
+
 def _reason(length: float, limit: float) -> str:
     if not np.isfinite(length):
         return "no spot can be there"
@@ -217,7 +228,8 @@ def _fit(
     n_rejected: int,
     unit: float,
 ) -> Fit:
-    rms = estimate.rms_px if account.older else rms_px(residuals)
+    seen = np.isfinite(residuals).all(axis=1)
+    rms = estimate.rms_px if account.older else rms_px(residuals[seen])
     if troubles:
         status = "not to be trusted: " + "; ".join(troubles)
     else:

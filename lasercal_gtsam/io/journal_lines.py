@@ -282,9 +282,15 @@ def sealed(seq: int, batch: int, kind: str, payload: Mapping[str, Any]) -> bytes
 def _record(path: Path, line: _Line) -> Record:
     try:
         content = json.loads(line.raw)
-        return Record(line.seq, content["kind"], content["payload"])
+        return Record(line.seq, content["kind"], _object(content["payload"]))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}:{line.line}: not a record of this format: {error!r}") from None
+
+
+def _object(value: Any) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TypeError(f"expected an object, got {value!r:.60}")
+    return value
 
 
 def header_of(path: Path, raw: bytes) -> Header:
@@ -293,7 +299,7 @@ def header_of(path: Path, raw: bytes) -> Header:
         payload = json.loads(raw)["payload"]
         version = payload["version"]
         if version == VERSION:
-            return Header(payload["created"], payload["about"])
+            return Header(payload["created"], _object(payload["about"]))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path}:1: the header cannot be understood: {error!r}") from None
     raise DataError(

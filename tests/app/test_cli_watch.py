@@ -34,7 +34,8 @@ from lasercal_gtsam.cli.live import Screen
 from lasercal_gtsam.incremental import IncrementalCalibrator
 from lasercal_gtsam.incremental.journaled import JournaledCalibrator
 from lasercal_gtsam.io.history_file import read_history
-from lasercal_gtsam.io.journal import JournalReader
+from lasercal_gtsam.io.journal import Journal, JournalReader
+from lasercal_gtsam.io.journal_lines import sealed
 from lasercal_gtsam.io.spot_lines import SpotLines
 
 # the first child of a fresh installation compiles everything
@@ -420,6 +421,46 @@ def test_killed_while_the_journal_was_begun(lasercal, growing, rows):
     result.write_bytes(begun)
     journal.write_bytes(header + first)
     assert f"Ended: 1 spot taken, {START + 2} in all." in lasercal(*args).out
+
+
+@pytest.mark.parametrize(
+    ("kind", "payload", "words"),
+    [
+        (
+            "reset",
+            {"hand": "camera"},
+            "is a 'reset' with {'hand': 'camera'}; expected the names of",
+        ),
+        ("reset", {"camera": ["camera"]}, "expected the names of parts (camera, laser, plane)"),
+        ("spot", {"id": 7}, "these are no spots"),
+        ("turn", {}, "is a 'turn', which this program does not know"),
+    ],
+)
+def test_records_that_make_no_sense(lasercal, growing, rows, kind, payload, words):
+    append(growing, *rows[1:4])
+    watch = "watch", growing, "--once", "--calibration", growing.parent / "start.json"
+    assert lasercal(*watch).status == 0
+    path = growing / "calibration.journal.jsonl"
+    with Journal.open(path) as journal:
+        journal.append(kind, payload)
+    again = lasercal(*watch)
+    assert again.status == 1
+    assert words in again.err
+    assert "Traceback" not in again.err
+
+
+def test_a_header_that_is_no_object(lasercal, growing, rows):
+    append(growing, *rows[1:4])
+    watch = "watch", growing, "--once", "--calibration", growing.parent / "start.json"
+    assert lasercal(*watch).status == 0
+    path = growing / "calibration.journal.jsonl"
+    first, *others = path.read_bytes().splitlines(keepends=True)
+    record = json.loads(first)
+    record["payload"]["about"] = 7
+    path.write_bytes(b"".join([sealed(0, 0, record["kind"], record["payload"]), *others]))
+    again = lasercal(*watch)
+    assert again.status == 1
+    assert "the header cannot be understood" in again.err
 
 
 def test_wrong_columns_at_the_start_are_an_error(lasercal, growing):

@@ -49,6 +49,8 @@ def test_strength_is_in_sigmas():
     assert svd.weak_directions() == ()
     # three times the noise, a third of the information
     assert [w.strength for w in svd.weak_directions(sigma=3.0)] == pytest.approx([2 / 3] * 5)
+    nothing = RangeSvd.of(0.0 * R, LABELS, np.ones(5, dtype=bool)).weak_directions(sigma=0.0)
+    assert [w.strength for w in nothing] == [0.0] * 5
     np.testing.assert_allclose(svd.covariance(), np.diag((plausible_ranges(LABELS) / 2) ** 2))
 
 

@@ -19,6 +19,7 @@ from incremental_cases import (
 import lasercal_gtsam as lc
 from lasercal_gtsam.cell import Beam, Camera, Cell, Intrinsics
 from lasercal_gtsam.incremental import IncrementalCalibrator
+from lasercal_gtsam.io.conventions import columns_from_rotations, rotations_from_columns
 from lasercal_gtsam.rotations import rotation_exp
 from lasercal_gtsam.simulate import Noise, simulate
 
@@ -183,6 +184,28 @@ def test_a_gross_outlier_is_left_out_named_and_accounted_for():
     )
     account = {s.id: s.rejected for s in update.calibration.spots}
     assert account["bad"] is not None and sum(r is not None for r in account.values()) == 1
+
+
+def test_spots_that_count_but_cannot_be_make_an_answer_that_is_not_trusted():
+    """New hand poses read in a wrong way; the stated noise of the robot makes room for them."""
+    noise = Noise.table1()
+    made = simulate("paper-1", 0, noise, groups=3, shots=4)
+    hand = {"hand_sigma_m": 1e-3, "hand_sigma_rad": noise.hand_rotation_rad, "sigma_px": 1.0}
+    options = lc.CalibrationOptions(**hand, distortion="none", robust="none")
+    first = lc.calibrate(made.observations, initial=made.truth, options=options)
+    T = made.observations.T_base_hand[:4].copy()
+    quat = columns_from_rotations("quat_wxyz", T[:, :3, :3]) * np.array([-1.0, 1.0, 1.0, 1.0])
+    T[:, :3, :3] = rotations_from_columns("quat_wxyz", quat)
+    seen = replace(made.observations[:4], T_base_hand=T, id=np.array(list("abcd")))
+    running = IncrementalCalibrator(first)
+    running.add(seen)
+    answer = running.calibration
+    counted = np.array([spot.residual_px for spot in answer.spots if spot.rejected is None])
+    impossible = int(np.isnan(counted[:, 0]).sum())
+    assert impossible > 0
+    assert not answer.fit.converged
+    assert f"{impossible} of {len(counted)} spots that count cannot be" in answer.fit.status
+    assert np.isfinite(answer.fit.rms_px)
 
 
 def test_ten_percent_outliers_do_not_move_it():
