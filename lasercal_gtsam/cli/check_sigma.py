@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from lasercal_gtsam.cli.console import bullets, json_option, print_json, progress, wrapped
+from lasercal_gtsam.cli.console import (
+    bullets,
+    json_option,
+    print_json,
+    progress,
+    seed_option,
+    wrapped,
+)
 from lasercal_gtsam.cli.outputs import check_target
 from lasercal_gtsam.cli.texts import count
 
@@ -32,14 +39,7 @@ FORMAT, VERSION = "lasercal-sigma-check", 1
     show_default=True,
     help="How often to simulate and solve. With N trials a spread is known to 1/sqrt(2N).",
 )
-@click.option(
-    "--seed",
-    metavar="N",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="Of the simulated noise; the same seed gives the same numbers.",
-)
+@seed_option("Of the simulated noise; the same seed gives the same numbers.")
 @click.option(
     "--from-data",
     is_flag=True,

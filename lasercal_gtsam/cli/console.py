@@ -9,11 +9,12 @@ import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 
 Progress = Callable[[int, int], None]
+F = TypeVar("F", bound=Callable[..., Any])
 
 # between two lines about the progress where there is no terminal
 _LINE_SECONDS = 60.0
@@ -21,6 +22,18 @@ _LINE_SECONDS = 60.0
 json_option = click.option(
     "--json", "as_json", is_flag=True, help="Print the result as one JSON document on stdout."
 )
+
+
+def seed_option(what: str, default: int = 0) -> Callable[[F], F]:
+    """``--seed N``; ``what`` says what the seed decides."""
+    return click.option(
+        "--seed",
+        metavar="N",
+        type=click.IntRange(min=0),
+        default=default,
+        show_default=True,
+        help=what,
+    )
 
 
 def warn(warnings: Iterable[str]) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from lasercal_gtsam.cli.calibrate import CALIBRATION_FILE, save, save_report
-from lasercal_gtsam.cli.console import json_option, print_json, progress, wrapped
+from lasercal_gtsam.cli.console import json_option, print_json, progress, seed_option, wrapped
 from lasercal_gtsam.cli.detect import SHEET_FILE, SPOTS_FILE, find_spots, save_sheet, save_spots
 from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.cli.report import REPORT_FILE
@@ -48,14 +48,7 @@ _CONTENTS = {
     show_default=True,
     help="The folder for everything that is made; an earlier demo there is replaced.",
 )
-@click.option(
-    "--seed",
-    metavar="N",
-    type=click.IntRange(min=0),
-    default=1,
-    show_default=True,
-    help="Another seed is another robot cell, with other pictures.",
-)
+@seed_option("Another seed is another robot cell, with other pictures.", default=1)
 @click.option("--force", is_flag=True, help="Use OUT also where other files are in it.")
 @json_option
 def demo(out: Path, seed: int, force: bool, as_json: bool) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
-from lasercal_gtsam.cli.console import json_option, print_json
+from lasercal_gtsam.cli.console import json_option, print_json, seed_option
 from lasercal_gtsam.cli.outputs import is_of
 from lasercal_gtsam.cli.pose_options import pose_options
 from lasercal_gtsam.cli.texts import count
@@ -117,14 +117,7 @@ if TYPE_CHECKING:
     type=click.FloatRange(min=0, min_open=True),
     help="Pixel noise that the promise assumes.  [default: 1; with --next the calibration's own]",
 )
-@click.option(
-    "--seed",
-    metavar="N",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="The same seed gives the same plan.",
-)
+@seed_option("The same seed gives the same plan.")
 @pose_options
 @json_option
 def plan(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import click
 
-from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
+from lasercal_gtsam.cli.console import json_option, print_json, progress, seed_option, warn, wrapped
 from lasercal_gtsam.cli.outputs import capture_folder
 from lasercal_gtsam.cli.pose_options import pose_options
 from lasercal_gtsam.cli.texts import count
@@ -43,14 +43,7 @@ class _WithPresets(click.Command):
     show_default=True,
     help="The cell and how the hand moves in it; listed below.",
 )
-@click.option(
-    "--seed",
-    metavar="N",
-    type=click.IntRange(min=0),
-    default=0,
-    show_default=True,
-    help="The same seed gives the same capture to the last bit.",
-)
+@seed_option("The same seed gives the same capture to the last bit.")
 @click.option(
     "--groups", metavar="N", type=click.IntRange(min=1), help="Hand rotations on every plane."
 )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from lasercal_gtsam.cli.console import json_option, print_json, progress, warn, wrapped
+from lasercal_gtsam.cli.console import json_option, print_json, progress, seed_option, warn, wrapped
 from lasercal_gtsam.cli.values import Names, Numbers
 from lasercal_gtsam.errors import DataError
 
@@ -45,14 +45,7 @@ def _shared(trials: int) -> Callable[[F], F]:
             show_default=True,
             help="How often each point is simulated and solved.",
         ),
-        click.option(
-            "--seed",
-            metavar="N",
-            type=click.IntRange(min=0),
-            default=0,
-            show_default=True,
-            help="The same seed gives the same numbers, whatever runs them.",
-        ),
+        seed_option("The same seed gives the same numbers, whatever runs them."),
         click.option(
             "-j",
             "--jobs",
