@@ -17,7 +17,7 @@ from lasercal_gtsam.errors import DataError
 if TYPE_CHECKING:
     from lasercal_gtsam.cell import Cell
     from lasercal_gtsam.formats.given_intrinsics import How
-    from lasercal_gtsam.formats.intrinsics import KnownIntrinsics
+    from lasercal_gtsam.formats.intrinsics import GivenIntrinsics
     from lasercal_gtsam.observations import Observations
     from lasercal_gtsam.options import CalibrationOptions
 
@@ -37,11 +37,11 @@ class GivenLens:
     how: How
     sigmas: Mapping[str, float]
 
-    def load(self, observations: Observations) -> dict[str, KnownIntrinsics]:
+    def load(self, observations: Observations) -> dict[str, GivenIntrinsics]:
         """Camera name to its lens; `DataError` where a file or a name is wrong."""
         from lasercal_gtsam.formats.intrinsics import load_intrinsics
 
-        found: dict[str, KnownIntrinsics] = {}
+        found: dict[str, GivenIntrinsics] = {}
         for text in self.files:
             camera, path, entry = _parts(text)
             if camera is None:

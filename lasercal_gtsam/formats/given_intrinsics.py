@@ -10,7 +10,7 @@ import numpy as np
 
 from lasercal_gtsam.cell import INTRINSIC_NAMES, Camera, Cell
 from lasercal_gtsam.errors import DataError
-from lasercal_gtsam.formats.intrinsics import KnownIntrinsics
+from lasercal_gtsam.formats.intrinsics import GivenIntrinsics
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 
@@ -22,7 +22,7 @@ ROWS = tuple("alpha_c" if name == "skew" else name for name in INTRINSIC_NAMES)
 def with_intrinsics(
     options: CalibrationOptions,
     observations: Observations,
-    given: Mapping[str, KnownIntrinsics],
+    given: Mapping[str, GivenIntrinsics],
     how: How,
     sigmas: Mapping[str, float] | None = None,
 ) -> tuple[CalibrationOptions, tuple[str, ...]]:
@@ -62,7 +62,7 @@ def with_intrinsics(
     return options, tuple(words)
 
 
-def _held(options: CalibrationOptions, prefix: str, lens: KnownIntrinsics) -> CalibrationOptions:
+def _held(options: CalibrationOptions, prefix: str, lens: GivenIntrinsics) -> CalibrationOptions:
     # what names the same numbers in other words must go
     other = {prefix + "principal_point", prefix + "aspect"}
     known = {name: value for name, value in options.known.items() if name not in other}
@@ -71,7 +71,7 @@ def _held(options: CalibrationOptions, prefix: str, lens: KnownIntrinsics) -> Ca
 
 
 def _with_priors(
-    options: CalibrationOptions, prefix: str, lens: KnownIntrinsics, sigmas: Mapping[str, float]
+    options: CalibrationOptions, prefix: str, lens: GivenIntrinsics, sigmas: Mapping[str, float]
 ) -> tuple[CalibrationOptions, list[str]]:
     from_file, factor = prior_sigmas(lens)
     found = {**from_file, **sigmas}
@@ -106,7 +106,7 @@ def _with_priors(
 def start_with_intrinsics(
     observations: Observations,
     options: CalibrationOptions,
-    given: Mapping[str, KnownIntrinsics],
+    given: Mapping[str, GivenIntrinsics],
     initial: Cell | None = None,
 ) -> Cell:
     """A start with these lenses: ``initial`` with them, or the best cell while they are held.
@@ -136,7 +136,7 @@ def start_with_intrinsics(
     return calibrate(observations, options=replace(held, priors=priors)).cell
 
 
-def prior_sigmas(lens: KnownIntrinsics) -> tuple[dict[str, float], float]:
+def prior_sigmas(lens: GivenIntrinsics) -> tuple[dict[str, float], float]:
     """Sigmas of independent priors on the table's rows, and the factor they were widened by.
 
     With ``D`` the variances and ``w`` the largest eigenvalue of the correlations, ``w D`` is the
@@ -161,7 +161,7 @@ def prior_sigmas(lens: KnownIntrinsics) -> tuple[dict[str, float], float]:
     return dict(zip(ROWS, (factor * sigmas).tolist(), strict=True)), factor
 
 
-def check_given(observations: Observations, given: Mapping[str, KnownIntrinsics], how: How) -> None:
+def check_given(observations: Observations, given: Mapping[str, GivenIntrinsics], how: How) -> None:
     """Raise `DataError` where a lens cannot belong to the camera it is given for."""
     if how not in get_args(How):
         raise DataError(f"intrinsics: expected one of {', '.join(get_args(How))}, got {how!r}")

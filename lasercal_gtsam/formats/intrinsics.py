@@ -27,7 +27,7 @@ READABLE = (
 
 
 @dataclass(frozen=True, eq=False)
-class KnownIntrinsics(FrozenData):
+class GivenIntrinsics(FrozenData):
     """A lens out of a file.
 
     Attributes
@@ -60,7 +60,7 @@ class KnownIntrinsics(FrozenData):
         return dict(zip(INTRINSIC_NAMES, sigmas.tolist(), strict=True))
 
 
-def load_intrinsics(path: str | Path, camera: str | None = None) -> KnownIntrinsics:
+def load_intrinsics(path: str | Path, camera: str | None = None) -> GivenIntrinsics:
     """Read the intrinsics of a camera; the kind of file is told by its content.
 
     Parameters
@@ -87,25 +87,25 @@ def load_intrinsics(path: str | Path, camera: str | None = None) -> KnownIntrins
         return _from_json(text, name, camera)
     if start.startswith(("%YAML:1.0", "<?xml", "<opencv_storage")) or "opencv-matrix" in text:
         lens, size, covariance = opencv_storage.intrinsics_of(content, name)
-        return KnownIntrinsics(lens, size, covariance, "", "OpenCV FileStorage", name)
+        return GivenIntrinsics(lens, size, covariance, "", "OpenCV FileStorage", name)
     if "'lensmodel'" in text or "'lens_model'" in text or '"lensmodel"' in text:
         lens, size = mrcal_model.intrinsics_of(mrcal_model.fields_of(content, name))
-        return KnownIntrinsics(lens, size, None, "", "mrcal cameramodel", name)
+        return GivenIntrinsics(lens, size, None, "", "mrcal cameramodel", name)
     fields = Fields.yaml(content, name)
     if labels := kalibr.cameras_in(fields):
         label = _one_of(labels, camera, name)
         lens, size = kalibr.intrinsics_of(fields, label)
-        return KnownIntrinsics(lens, size, None, label, "Kalibr camchain", name)
+        return GivenIntrinsics(lens, size, None, label, "Kalibr camchain", name)
     if "camera_matrix" in fields:
         lens, size, found = ros_camera_info.intrinsics_of(fields)
-        return KnownIntrinsics(lens, size, None, found, "ROS camera_info", name)
+        return GivenIntrinsics(lens, size, None, found, "ROS camera_info", name)
     raise DataError(
         f"{name}: this is no file of intrinsics that can be read; its keys are "
         f"{some(fields.keys)}; readable are {READABLE}"
     )
 
 
-def _from_json(text: str, name: str, camera: str | None) -> KnownIntrinsics:
+def _from_json(text: str, name: str, camera: str | None) -> GivenIntrinsics:
     try:
         data = json.loads(text)
     except json.JSONDecodeError as error:
@@ -122,7 +122,7 @@ def _from_json(text: str, name: str, camera: str | None) -> KnownIntrinsics:
         raise DataError(f"{name}: covariance: expected labels and a square matrix") from None
 
 
-def _from_npz(content: bytes, name: str, camera: str | None) -> KnownIntrinsics:
+def _from_npz(content: bytes, name: str, camera: str | None) -> GivenIntrinsics:
     try:
         held = plain_data.read_npz(content)
         cameras = {
@@ -137,7 +137,7 @@ def _from_npz(content: bytes, name: str, camera: str | None) -> KnownIntrinsics:
 
 def _from_cell(
     cell: Cell, labels: tuple[str, ...], covariance: Array, name: str, camera: str | None
-) -> KnownIntrinsics:
+) -> GivenIntrinsics:
     chosen = _one_of(list(cell.cameras), camera, name)
     found = cell.cameras[chosen]
     wanted = [f"{chosen}.{term}" for term in CAMERA_TANGENT[6:]]
@@ -146,7 +146,7 @@ def _from_cell(
         rows = [labels.index(label) for label in wanted]
         block = covariance[np.ix_(rows, rows)]
         block = block if np.isfinite(block).all() else None
-    return KnownIntrinsics(found.intrinsics, found.image_size, block, chosen, "lasercal", name)
+    return GivenIntrinsics(found.intrinsics, found.image_size, block, chosen, "lasercal", name)
 
 
 def _one_of(names: list[str], wanted: str | None, where: str) -> str:
