@@ -7,6 +7,7 @@ common sense does.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ WEAK = 1.0
 SINGULAR = 1e-4
 # what is named of a direction: shares of its largest part, and how many
 _NAMED_SHARE, _NAMED_COUNT = 0.3, 6
+# undetermined directions that a sentence names
+_SHOWN = 5
 
 _RANGES = {
     "rot": 0.1, "trans": 0.05, "fu": 50.0, "fv": 50.0, "skew": 10.0, "u0": 50.0, "v0": 50.0,
@@ -88,6 +91,14 @@ class RangeSvd:
             words = ", ".join(_amount(self.labels[j], sign * move[j] * self.ranges[j]) for j in top)
             found.append(WeakDirection(float(strength), words))
         return tuple(found)
+
+
+def undetermined(weak: Sequence[WeakDirection]) -> str:
+    """What the spots leave open, for a sentence: how many directions, and the weakest of them."""
+    shown = "; ".join(f"({i}) {w.words}" for i, w in enumerate(weak[:_SHOWN], start=1))
+    more = f"; and {len(weak) - _SHOWN} more" if len(weak) > _SHOWN else ""
+    count = f"{len(weak)} combination{'' if len(weak) == 1 else 's'}"
+    return f"the spots leave {count} of unknowns undetermined: {shown}{more}"
 
 
 def _kind(label: str) -> str:

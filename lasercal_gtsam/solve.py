@@ -12,7 +12,7 @@ from lasercal_gtsam.cell import Cell, Intrinsics
 from lasercal_gtsam.errors import DegenerateError, LasercalError, SolveError
 from lasercal_gtsam.frozen import Array
 from lasercal_gtsam.graph import CELL_KEY, CellGraph, state_from_cell
-from lasercal_gtsam.observability import SINGULAR, RangeSvd
+from lasercal_gtsam.observability import SINGULAR, RangeSvd, undetermined
 from lasercal_gtsam.report_map import tangent_labels
 
 # Newton decrement (distance to the optimum in sigmas) at which a solution counts as reached
@@ -112,10 +112,8 @@ def refuse_if_singular(problem: CellGraph, values: gtsam.Values) -> RangeSvd:
     weak = svd.weak_directions(SINGULAR)
     if weak:
         raise DegenerateError(
-            f"the spots leave {len(weak)} combination(s) of unknowns undetermined: "
-            + "; ".join(f"({i + 1}) {w.words}" for i, w in enumerate(weak))
-            + ". Add hand orientations (at least three, not about one axis), longer translations "
-            "or a tilted plane, or hold what is known"
+            f"{undetermined(weak)}. Add hand orientations (at least three, not about one axis), "
+            "longer translations or a tilted plane, or hold what is known"
         )
     return svd
 

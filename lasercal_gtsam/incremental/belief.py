@@ -32,7 +32,7 @@ from lasercal_gtsam.graph import (
     expansion,
     state_from_cell,
 )
-from lasercal_gtsam.observability import SINGULAR, RangeSvd
+from lasercal_gtsam.observability import SINGULAR, RangeSvd, undetermined
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.report_map import (
     BEAM_TANGENT,
@@ -133,10 +133,7 @@ class Belief:
         svd = RangeSvd.of(R, tangent_labels(self.cell), ~self.held)
         weak = svd.weak_directions(SINGULAR)
         if weak:
-            raise DegenerateError(
-                f"{len(weak)} combination(s) of unknowns are not determined: "
-                + "; ".join(f"({i + 1}) {w.words}" for i, w in enumerate(weak))
-            )
+            raise DegenerateError(undetermined(weak))
         E = self.expansion
         return np.asarray(E @ svd.covariance() @ E.T)
 

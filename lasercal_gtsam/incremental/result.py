@@ -24,7 +24,7 @@ from lasercal_gtsam.graph import make_batch, pixel_covariances, state_from_cell
 from lasercal_gtsam.hand_noise import HandNoise, corrected_batch, corrections, linearized
 from lasercal_gtsam.incremental.beginning import determined
 from lasercal_gtsam.incremental.estimate import Estimate
-from lasercal_gtsam.observability import SINGULAR, RangeSvd
+from lasercal_gtsam.observability import SINGULAR, RangeSvd, undetermined
 from lasercal_gtsam.observations import Observations
 from lasercal_gtsam.options import CalibrationOptions
 from lasercal_gtsam.projection import project
@@ -129,11 +129,9 @@ def calibration_of(
         rejected[k - first] = "held back: it waits for more spots, or for the end of an alarm"
     used = np.array([reason is None for reason in rejected], dtype=np.bool_)
     svd = RangeSvd.of(estimate.R[:-1, :-1], uncertainty.labels, ~(estimate.fixed | estimate.open))
-    undetermined = [
-        f"the spots do not determine this combination: {w.words}"
-        for w in svd.weak_directions(SINGULAR, sigma=estimate.sigma0)
-    ]
-    troubles = [*account.troubles, *undetermined, *_impossible(residuals[used])]
+    troubles = [*account.troubles, *_impossible(residuals[used])]
+    if singular := svd.weak_directions(SINGULAR, sigma=estimate.sigma0):
+        troubles.append(undetermined(singular))
     fit = _fit(estimate, account, troubles, residuals[used], int((~used).sum()), unit)
     notes = [*fold_warnings(cell), *report_notes(cell, uncertainty)]
     if account.older:

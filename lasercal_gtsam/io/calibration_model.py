@@ -45,6 +45,9 @@ POSE_AGREEMENT = 10 * ROTATION_TOLERANCE
 # A pixel, a length or a coefficient that is smaller is 0: its square would be.
 _SMALLEST = 1e-100
 
+# of correlations; those of a real result are symmetric to the last digit
+_COVARIANCE_ROUNDING = 1e-6
+
 _LARGEST_WHOLE = 10**300  # more do not fit into a float
 
 _INFINITIES = {"inf": math.inf, "-inf": -math.inf}
@@ -408,6 +411,11 @@ class CalibrationModel(CellModel):
         if odd or len(set(labels)) < len(labels):
             found = f"{odd[0]!r:.60}" if odd else "a label twice"
             yield f"covariance.labels: expected those of the cell's parts, got {found}"
+        if not _may_be_covariance(self.covariance.matrix):
+            yield (
+                "covariance.matrix: expected a symmetric matrix without a direction of negative "
+                "variance"
+            )
         if [spot.id for spot in self.spots] != observations.id.tolist():
             yield "spots, inputs.observations: expected the same ids in the same order"
             return
@@ -428,6 +436,21 @@ class CalibrationModel(CellModel):
             rejected=tuple(s.rejected for s in self.spots),
             leverage=np.array([s.leverage for s in self.spots]),
         )
+
+
+def _may_be_covariance(C: Array) -> bool:
+    """Whether it is one up to rounding; not known of one with NaN (no degrees of freedom)."""
+    if not np.isfinite(C).all():
+        return True
+    variances = np.diag(C)
+    if (variances < 0.0).any() or C[variances == 0.0].any():
+        return False
+    root = np.sqrt(variances)
+    scale = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0.0)
+    correlations = C * scale[:, None] * scale
+    if np.abs(correlations - correlations.T).max(initial=0.0) > _COVARIANCE_ROUNDING:
+        return False
+    return not np.linalg.eigvalsh(correlations)[:1] < -_COVARIANCE_ROUNDING
 
 
 def _built(where: str, build: Callable[[], T], problems: list[str]) -> T | None:

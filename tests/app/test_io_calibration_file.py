@@ -148,7 +148,7 @@ def test_any_float_survives(x: float, y: float) -> None:
 
     calibration = make(
         parameters=(Parameter("fu", x, y, abs(x), "px"),),
-        covariance=np.array([[x, y], [y, 1.0]]),
+        covariance=np.diag([abs(x), abs(y)]),
         labels=LABELS[:2],
     )
     text = json.dumps(to_dict(calibration), allow_nan=False)
@@ -349,6 +349,19 @@ def test_covariance_must_fit_its_labels(saved: tuple[Path, dict]) -> None:
     data["covariance"]["labels"].pop()
     path.write_text(json.dumps(data))
     assert "expected shape (3, 3), got (4, 4)" in refusal(path)[0]
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value"), [(2, 2, -1.0), (0, 1, 1e3), (3, 3, 0.0), (1, 1, 1e-9)]
+)
+def test_what_is_no_covariance(
+    saved: tuple[Path, dict], row: int, column: int, value: float
+) -> None:
+    path, data = saved
+    matrix = data["covariance"]["matrix"]
+    matrix[row][column] = matrix[column][row] = value
+    path.write_text(json.dumps(data))
+    assert "covariance.matrix: expected a symmetric matrix without" in refusal(path)[0]
 
 
 @pytest.mark.parametrize(
