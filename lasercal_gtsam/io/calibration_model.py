@@ -100,9 +100,16 @@ def _not_negative(value: float) -> float:
     return value
 
 
+def _share(value: float) -> float:
+    if not 0.0 <= value <= 1.0 + 1e-9:
+        raise ValueError(f"expected a weight from 0 to 1, got {value:g}")
+    return value
+
+
 Number = Annotated[float, BeforeValidator(_number)]
 Sigma = Annotated[float, BeforeValidator(_number), AfterValidator(_not_negative)]
 Ordinary = Annotated[float, BeforeValidator(_number), AfterValidator(_ordinary)]
+Weight = Annotated[float, BeforeValidator(_number), AfterValidator(_share)]
 Vector2 = Annotated[Array, PlainValidator(_array(2, largest=LARGEST))]
 Vector3 = Annotated[Array, PlainValidator(_array(3, largest=LARGEST))]
 Vector4 = Annotated[Array, PlainValidator(_array(4, largest=LARGEST))]
@@ -284,7 +291,7 @@ class SpotModel(_Part):
     camera: str
     laser: str
     residual_px: Vector2
-    weight: Number
+    weight: Weight
     rejected: str | None
     leverage: Number = math.nan  # unknown to older files
 

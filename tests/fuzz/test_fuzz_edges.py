@@ -162,6 +162,7 @@ def _set(data: dict[str, Any], path: str, value: Any) -> None:
             "expected those of the cell's parts, got a label twice",
         ),
         ("covariance/labels/3", "x", "expected those of the cell's parts, got 'x'"),
+        ("spots/1/weight", -1.0, "spots.1.weight: expected a weight from 0 to 1, got -1"),
         ("spots/2/id", "other", "expected the same ids in the same order"),
         ("parameters/0/sigma", -1.0, "parameters.0.sigma: expected a sigma, 0 or more, got -1"),
         ("fit/sigma0", 1e300, "fit.sigma0: expected a number up to 1e+12"),
