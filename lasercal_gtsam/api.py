@@ -195,6 +195,8 @@ def _closed_form_starts(search: Search) -> Ways:
     except DegenerateError as error:
         failure = error
 
+    aside = found[0].set_aside if found else ()
+
     def refine(search: Search, cells: Sequence[Cell]) -> Solution:
         if failure is not None and not cells:
             raise failure
@@ -207,7 +209,7 @@ def _closed_form_starts(search: Search) -> Ways:
         [holds.apply(candidate.cell) for candidate in found],
         refine,
         parts_of(search.observations, closed_form, options.seed),
-        suspicious=bool(found and found[0].set_aside),
+        agreed=~np.isin(search.observations.id, aside) if aside else None,
     )
 
 

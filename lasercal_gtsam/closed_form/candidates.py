@@ -9,13 +9,13 @@ import numpy as np
 
 from lasercal_gtsam.cell import Beam, Camera, Cell, Plane
 from lasercal_gtsam.closed_form.camera import KnownIntrinsics
-from lasercal_gtsam.closed_form.complete import complete_cell, is_complete
+from lasercal_gtsam.closed_form.complete import SPOTS_FOR_PLANE, complete_cell, is_complete
 from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, thinned
 from lasercal_gtsam.closed_form.information import check_information
 from lasercal_gtsam.closed_form.outliers import set_aside, solve_pair_without_outliers
 from lasercal_gtsam.closed_form.pair import PairCandidate
 from lasercal_gtsam.closed_form.solution import NEGATIVE_DEPTH_PENALTY_PX, cell_reprojection
-from lasercal_gtsam.closed_form.spots import Spots, pairs_of, pixel_scaling
+from lasercal_gtsam.closed_form.spots import Index, Spots, pairs_of, pixel_scaling
 from lasercal_gtsam.errors import DegenerateError
 from lasercal_gtsam.observations import Observations
 
@@ -32,7 +32,8 @@ class Candidate:
     rms_px : root mean square distance over the spots that were used, pixels
     method : how it was found, for the log
     negative_depths : fraction of spots behind the camera or behind the laser
-    set_aside : labels of spots far off from the best start, which none of the starts used
+    set_aside : labels of spots that none of the starts used: far off from the best, or in no
+        agreement with the others
     """
 
     cell: Cell
@@ -53,6 +54,7 @@ class _Pair:
     laser: str
     spots: Spots
     found: list[PairCandidate]
+    aside: Index
 
 
 def closed_form_candidates(
@@ -106,20 +108,26 @@ def closed_form_candidates(
         everything = Spots.of_pair(observations, camera, laser)
         spots = thinned(everything, tolerance_rad=group_tolerance_rad)
         try:
-            found = solve_pair_without_outliers(spots, known[camera], group_tolerance_rad)
+            found, aside = solve_pair_without_outliers(spots, known[camera], group_tolerance_rad)
         except DegenerateError as error:
             reasons.append(f"camera {camera!r} with laser {laser!r}: {error}")
             continue
-        pairs.append(_Pair(camera, laser, everything, found))
+        if len(spots) < len(everything):
+            aside = set_aside(found[0].solution, everything)
+        pairs.append(_Pair(camera, laser, everything, found, everything.rows[aside]))
     if not pairs:
         raise DegenerateError("\n".join(reasons) or "there are no spots")
     pairs.sort(key=lambda pair: len(pair.spots))
-    used = np.ones(len(observations), dtype=bool)
+    agreed = np.ones(len(observations), dtype=bool)
     for pair in pairs:
-        used[pair.spots.rows[set_aside(pair.found[0].solution, pair.spots)]] = False
-    aside = tuple(str(name) for name in observations.id[~used])
-    if aside:
-        observations = observations[used]
+        agreed[pair.aside] = False
+    used = agreed.copy()
+    for p in range(len(observations.planes)):
+        mine = observations.plane_index == p
+        if agreed[mine].sum() < SPOTS_FOR_PLANE:  # found, at worst, from all that there are
+            used[mine] = True
+    left_out = tuple(str(name) for name in observations.id[~used])
+    judges, observations = observations[agreed], observations[used]
     candidates: list[Candidate] = []
     refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
@@ -135,8 +143,8 @@ def closed_form_candidates(
             except DegenerateError as error:
                 refusal = error
                 continue
-        rms, negative = cell_reprojection(cell, observations)
-        candidates.append(Candidate(cell, rms, chosen[-1].method, negative, aside))
+        rms, negative = cell_reprojection(cell, judges)
+        candidates.append(Candidate(cell, rms, chosen[-1].method, negative, left_out))
     if not candidates and refusal:
         raise refusal
     candidates.sort(key=lambda candidate: candidate.rank)

@@ -47,6 +47,8 @@ _ROUNDS = 10
 # how many agreements are tried, and parts of each; the share of its spots that must fit a solution
 # for it to be good, and for it to be better than nothing
 _AGREEMENTS, _PARTS, _GOOD, _USABLE = 3, 12, 0.8, 0.4
+# share of the fit that another round must keep
+_NO_WORSE = 0.95
 # solutions of a part that are judged by all spots
 _JUDGED = 6
 
@@ -66,8 +68,12 @@ class _Start(NamedTuple):
 
 def solve_pair_without_outliers(
     spots: Spots, known: KnownIntrinsics, group_tolerance_rad: float
-) -> list[PairCandidate]:
+) -> tuple[list[PairCandidate], Mask]:
     """`pair.solve_pair`, again without the spots that lie far off, until nothing changes.
+
+    Returns
+    -------
+    solutions, the best first, and (N,) which spots none of them was made from
 
     Raises
     ------
@@ -78,22 +84,26 @@ def solve_pair_without_outliers(
     everything = np.arange(len(spots))
     groups = find_groups(spots, group_tolerance_rad)
     solver = _Solver(spots, known, group_tolerance_rad)
+    nothing = np.zeros(len(spots), dtype=np.bool_)
     start = solver.solve(everything, search=False)
-    if start is not None and plausible(start.found[0], spots):
-        if within(start.distances, SUSPICIOUS).all():
-            return start.found
-    else:
+    if start is not None and not plausible(start.found[0], spots):
         start = None
+    if start is not None and within(start.distances, SUSPICIOUS).all():
+        return start.found, nothing
     agreed = solver.from_agreement(groups)
-    if agreed is None and start is None:
-        found = solve_pair(spots, groups, known)
-        start = _Start(found, spot_distances(found[0].solution, spots), everything, 0.0)
-        if within(start.distances, SUSPICIOUS).all():
-            return found
+    if start is None and (agreed is None or agreed.fit <= _USABLE * len(agreed.rows)):
+        start = solver.solve(everything, search=True)
+        if start is not None and within(start.distances, SUSPICIOUS).all():
+            return start.found, nothing
     if start is None or (agreed is not None and agreed.fit > start.fit):
         start = agreed
-    assert start is not None
-    return solver.rounds(start).found
+    if start is None:
+        solve_pair(spots, groups, known)  # says what is missing
+        raise AssertionError("solved the second time")
+    start = solver.rounds(start)
+    if len(start.rows) == len(spots):
+        return start.found, set_aside(start.found[0].solution, spots)
+    return start.found, ~np.isin(everything, start.rows)
 
 
 def set_aside(solution: Solution, spots: Spots) -> Mask:
@@ -160,12 +170,10 @@ class _Solver:
         return float(np.nansum(np.maximum(0.0, 1.0 - (distances / self.limit_px) ** 2)))
 
     def from_agreement(self, groups: Groups) -> _Start | None:
-        """The solution of shots that agree which most spots fit.
-
-        None where no part of the shots that agree has one that half as many spots fit.
-        """
+        """The solution of shots that agree which most spots fit; None if none can be solved."""
+        best: _Start | None = None
         for agreement in agreements(groups)[:_AGREEMENTS]:
-            count, best = len(agreement.rows), None
+            count = len(agreement.rows)
             for part in islice(agreement.parts(), _PARTS):
                 one = self.solve(part, search=False)
                 if one is not None and (best is None or one.fit > best.fit):
@@ -174,7 +182,7 @@ class _Solver:
                     return best
             if best is not None and best.fit > _USABLE * count:
                 return best
-        return None
+        return best
 
     def rounds(self, start: _Start) -> _Start:
         """Set aside and take back spots until nothing changes."""
@@ -185,6 +193,8 @@ class _Solver:
                 break
             again = self.solve(rows, search=True)
             if again is None or _median(again.distances) > 1.02 * _median(start.distances):
+                break
+            if again.fit < _NO_WORSE * start.fit:
                 break
             start = again
         return start

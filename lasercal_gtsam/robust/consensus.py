@@ -53,12 +53,22 @@ class Consensus:
         return float(np.mean(self.lengths <= rejection_length(len(self.lengths)) * self.scale))
 
 
-def consensus(search: Search, start: Cell, cell: Cell) -> Consensus | None:
+def consensus(
+    search: Search, start: Cell, cell: Cell, among: Mask | None = None
+) -> Consensus | None:
     """Minimise the Cauchy loss from ``cell``, which came from ``start``.
 
     The threshold follows the scale of the residuals downwards. The distortion stays where it is
-    until the rest fits, then comes in as in a staged start.
+    until the rest fits, then comes in as in a staged start. Where it is known which spots agree,
+    ``among`` them first: many outliers that agree as well could draw a start away that is good.
     """
+    if among is not None and not among.all():
+        first = _minimised(search, start, cell, among)
+        cell = cell if first is None else first.cell
+    return _minimised(search, start, cell, np.ones(len(search.batch), np.bool_))
+
+
+def _minimised(search: Search, start: Cell, cell: Cell, among: Mask) -> Consensus | None:
     stages: list[Holds] = [search.holds]
     if fits_distortion(search.holds, len(search.observations.cameras)):
         held = search.holds.without_distortion
@@ -70,10 +80,10 @@ def consensus(search: Search, start: Cell, cell: Cell) -> Consensus | None:
     iterations = 0
     for holds in stages:
         for _ in range(_ROUNDS):
-            possible = np.isfinite(lengths)
-            if possible.mean() < MOST_OUTLIERS:
+            possible = np.isfinite(lengths) & among
+            if possible.sum() < MOST_OUTLIERS * among.sum():
                 return None
-            scale = robust_scale(lengths, unknowns)
+            scale = robust_scale(lengths[among], unknowns)
             batch = search.batch if possible.all() else search.batch.weighted(possible)
             problem = make_graph(search.observations, batch, holds, cell, loss).rescaled(scale)
             try:
@@ -82,7 +92,7 @@ def consensus(search: Search, start: Cell, cell: Cell) -> Consensus | None:
                 return None
             cell, lengths = found.cell, lengths_of(search, found.cell)
             iterations += found.iterations
-            if abs(robust_scale(lengths, unknowns) - scale) < 0.01 * scale:
+            if abs(robust_scale(lengths[among], unknowns) - scale) < 0.01 * scale:
                 break
     return Consensus(start, cell, robust_scale(lengths, unknowns), lengths, iterations)
 

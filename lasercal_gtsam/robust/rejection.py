@@ -48,14 +48,14 @@ class Ways(NamedTuple):
     """Where to start, and how to go on from there.
 
     ``starts``: cells, the likeliest first. ``refine``: plain least squares from some of them.
-    ``parts``: more starts, from parts of the spots (`parts.parts_of`). ``suspicious``: the starts
-    were made without some of the spots.
+    ``parts``: more starts, from parts of the spots (`parts.parts_of`). ``agreed``: the spots that
+    the starts were made from, where they are not all.
     """
 
     starts: Sequence[Cell]
     refine: Refine
     parts: Parts | None = None
-    suspicious: bool = False
+    agreed: Mask | None = None
 
 
 class Finished(NamedTuple):
@@ -118,14 +118,14 @@ def refine_without_outliers(search: Search, ways: Ways, finish: Finish) -> Accep
         one camera, laser or plane do not fit.
     """
     accept = (None,) * len(search.batch)
-    plain = None if ways.suspicious else _plain(search, ways, finish)
+    plain = _plain(search, ways, finish) if ways.agreed is None else None
     clean = isinstance(plain, Finished) and looks_clean(search, plain.lengths)
     if isinstance(plain, Finished) and clean and plain.solution.plausible:
         return Accepted(plain, accept, ways.starts[0])
     best = _from_starts(search, ways, plain)
     settled = settles_it(search, best)
     if best is not None and plain is None and settled and not _named(search, best).any():
-        plain = _plain(search, ways, finish)  # the starts were suspicious, the spots are not
+        plain = _plain(search, ways, finish)  # all spots agree after all
         clean = isinstance(plain, Finished) and looks_clean(search, plain.lengths)
         if isinstance(plain, Finished) and clean and plain.solution.plausible:
             return Accepted(plain, accept, ways.starts[0])
@@ -161,7 +161,7 @@ def _from_starts(
         begins.append((ways.starts[0], plain.solution.cell))
     best = None
     for start, cell in begins:
-        best = best_of([best, consensus(search, start, cell)])
+        best = best_of([best, consensus(search, start, cell, ways.agreed)])
         if best is not None and best.share >= 1.0 - _FEW and settles_it(search, best):
             break
     return best
