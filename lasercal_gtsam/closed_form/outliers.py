@@ -47,8 +47,10 @@ _ROUNDS = 10
 # how many agreements are tried, and parts of each; the share of its spots that must fit a solution
 # for it to be good, and for it to be better than nothing
 _AGREEMENTS, _PARTS, _GOOD, _USABLE = 3, 12, 0.8, 0.4
+# share of them from which on the distances tell the outliers, and not what was solved
+_TELLING = 0.6
 # share of the fit that another round must keep
-_NO_WORSE = 0.95
+_NO_WORSE = 0.5
 # solutions of a part that are judged by all spots
 _JUDGED = 6
 
@@ -103,6 +105,9 @@ def solve_pair_without_outliers(
     start = solver.rounds(start)
     if len(start.rows) == len(spots):
         return start.found, set_aside(start.found[0].solution, spots)
+    if start.fit > _TELLING * len(start.rows):
+        near = within(start.distances, ASIDE, start.distances[start.rows])
+        return start.found, ~near | np.isnan(start.distances)
     return start.found, ~np.isin(everything, start.rows)
 
 
