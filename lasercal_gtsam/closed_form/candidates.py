@@ -127,19 +127,19 @@ def closed_form_candidates(
         if agreed[mine].sum() < SPOTS_FOR_PLANE:  # found, at worst, from all that there are
             used[mine] = True
     left_out = tuple(str(name) for name in observations.id[~used])
-    judges, observations = observations[agreed], observations[used]
+    judges, some = observations[agreed], observations[used]
     candidates: list[Candidate] = []
     refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
         chosen = [pair.found[min(k, len(pair.found) - 1)] for pair in pairs]
         cell = _merged(pairs, chosen)
-        whole = is_complete(cell, observations)
+        whole = is_complete(cell, some)
         # what the better start could not complete, a worse one completes from its errors only
         if refusal and not whole:
             continue
         if not whole:
             try:
-                cell = complete_cell(cell, observations, known, reasons)
+                cell = complete_cell(cell, some, known, reasons)
             except DegenerateError as error:
                 refusal = error
                 continue
