@@ -28,7 +28,9 @@ def check(calibrator, update, given):
     assert (update.phase == "collecting") == (update.cell is None)
     assert bool(update.missing) == (update.phase != "running")
     assert update.words
-    if update.alarm is not None:
+    if update.alarm is not None and not update.alarm.causes:
+        assert "what it is cannot be told" in update.alarm.words
+    elif update.alarm is not None:
         assert sum(c.probability for c in update.alarm.causes) == pytest.approx(1.0)
     for row in update.parameters:
         assert np.isfinite(row.refined) and not row.sigma < 0
