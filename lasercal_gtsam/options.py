@@ -14,6 +14,7 @@ Robust = Literal["auto", "none", "huber", "cauchy", "geman-mcclure", "gnc-tls"]
 HAND_NOISE_NAMES = ("hand_sigma_m", "hand_sigma_rad")
 # squares of sigmas beyond these over- or underflow, and no robot or camera has them
 SMALLEST_SIGMA, LARGEST_SIGMA = 1e-12, 1e6
+_MOST_ITERATIONS = 1_000_000
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2")
 
 
@@ -121,9 +122,11 @@ def _number_problems(options: CalibrationOptions) -> list[str]:
             f"0 or radians from {SMALLEST_SIGMA:g} to {LARGEST_SIGMA:g}",
         ),
         "max_iterations": (
-            isinstance(options.max_iterations, int) and options.max_iterations >= 1,
-            "an integer >= 1",
+            isinstance(options.max_iterations, int)
+            and 1 <= options.max_iterations <= _MOST_ITERATIONS,
+            f"an integer from 1 to {_MOST_ITERATIONS}",
         ),
+        "seed": (isinstance(options.seed, int) and options.seed >= 0, "an integer >= 0"),
     }
     return [
         f"options.{name}: expected {what}, got {getattr(options, name)!r}"

@@ -352,7 +352,8 @@ def test_covariance_must_fit_its_labels(saved: tuple[Path, dict]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "column", "value"), [(2, 2, -1.0), (0, 1, 1e3), (3, 3, 0.0), (1, 1, 1e-9)]
+    ("row", "column", "value"),
+    [(2, 2, -1.0), (0, 1, 1e3), (0, 1, 1e308), (3, 3, 0.0), (1, 1, 1e-9)],
 )
 def test_what_is_no_covariance(
     saved: tuple[Path, dict], row: int, column: int, value: float
