@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, fields
 
 from lasercal_gtsam.errors import DataError
+
+# no setting means anything beyond; pictures are of single precision
+_LARGEST = 1e9
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,10 @@ class DetectionOptions:
             value = getattr(self, f.name)
             if f.name in ("channel", "region", "divide_albedo") or value is None:
                 continue
-            if not math.isfinite(value) or value < 0:
+            if not 0 <= value <= _LARGEST:  # nor NaN
                 problems.append(
-                    f"DetectionOptions.{f.name}: expected a finite number, 0 or more, got {value}"
+                    f"DetectionOptions.{f.name}: expected a number from 0 to {_LARGEST:g}, got "
+                    f"{value:g}"
                 )
         if self.region is not None and len(self.region) < 3:
             problems.append(

@@ -6,6 +6,7 @@ lengths and the principal point of a camera matrix, so that a skew would be lost
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,9 @@ _DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs
 _WIDTH = ("image_width", "image_Width")
 _HEIGHT = ("image_height", "image_Height")
 _COUNTS = (4, 5, 8, 12, 14)
+_LARGEST_SIZE = 65535
+_TAG = re.compile(r"!![^\s,\]}]*")
+_TAGS = ("!!opencv-matrix", "!!map", "!!seq", "!!int", "!!float", "!!str")
 
 
 def write_storage(source: Source) -> Written:
@@ -94,13 +98,18 @@ def opened(content: bytes, name: str) -> Any:
     """A `cv2.FileStorage` of YAML, XML or JSON; `DataError` where OpenCV cannot read it."""
     import cv2
 
+    text = decoded(content, name)
+    for tag in _TAG.finditer(text):
+        if tag[0] not in _TAGS:  # OpenCV never comes back from some
+            line = text.count("\n", 0, tag.start()) + 1
+            raise DataError(
+                f"{name}:{line}: {tag[0]:.60}: expected no tag but {', '.join(_TAGS)}; what is "
+                "packed or sparse, write out as plain numbers"
+            )
     try:
-        storage = cv2.FileStorage(
-            decoded(content, name), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
-        )
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError) as error:
-        text = " ".join(str(error.__cause__ or error).split())
-        raise DataError(f"{name}: OpenCV cannot read it: {text:.200}") from None
+        raise _unreadable(name, error) from None
     if not storage.isOpened():
         raise DataError(f"{name}: OpenCV cannot read it")
     return storage
@@ -116,7 +125,20 @@ def intrinsics_of(
     DataError
         Not readable, without a camera matrix or distortion, or of a lens that is not ours.
     """
-    storage = opened(content, name)
+    import cv2
+
+    try:
+        return _read(opened(content, name), name)
+    except cv2.error as error:  # a list where a mapping should be, and the like
+        raise _unreadable(name, error) from None
+
+
+def _unreadable(name: str, error: Exception) -> DataError:
+    text = " ".join(str(error.__cause__ or error).split())
+    return DataError(f"{name}: OpenCV cannot read it: {text:.200}")
+
+
+def _read(storage: Any, name: str) -> tuple[Intrinsics, tuple[int, int] | None, Array | None]:
     K = _matrix(storage, _MATRIX, name)
     D = _matrix(storage, _DISTORTION, name).ravel()
     problems = []
@@ -162,7 +184,7 @@ def _size(storage: Any, name: str) -> tuple[int, int] | None:
         if not nodes:
             return None
         value = nodes[0].real() if nodes[0].isInt() or nodes[0].isReal() else 0.0
-        if not (value > 0 and value == int(value)):
+        if not (0 < value <= _LARGEST_SIZE and value == int(value)):
             raise DataError(f"{name}: {keys[0]}: expected a whole number of pixels above 0")
         found.append(int(value))
     return found[0], found[1]

@@ -454,13 +454,13 @@ def _may_be_covariance(C: Array) -> bool:
         return False
     root = np.sqrt(variances)
     scale = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0.0)
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         correlations = C * scale[:, None] * scale
     if not np.abs(correlations).max(initial=0.0) <= 1.0 + _COVARIANCE_ROUNDING:
         return False
     if np.abs(correlations - correlations.T).max(initial=0.0) > _COVARIANCE_ROUNDING:
         return False
-    return not np.linalg.eigvalsh(correlations)[:1] < -_COVARIANCE_ROUNDING
+    return bool(np.linalg.eigvalsh(correlations).min(initial=0.0) >= -_COVARIANCE_ROUNDING)
 
 
 def _built(where: str, build: Callable[[], T], problems: list[str]) -> T | None:

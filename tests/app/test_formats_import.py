@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import cv2
@@ -109,6 +110,20 @@ def written(folder, name, text):
     path = folder / name
     path.write_text(text)
     return path
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("data: [ 6.125e+02", "data: [ !!binary x", "opencv.yml:11: !!binary: expected no tag but"),
+        ("%YAML:1.0\n---\n", "%YAML:1.0\n---\n- 1\n", "OpenCV cannot read it"),
+        ("image_width: 640", "image_width: .inf", "image_width: expected a whole number of pixels"),
+    ],
+)
+def test_what_opencv_would_not_come_back_from(old, new, words, tmp_path):
+    assert old in OPENCV
+    with pytest.raises(lc.DataError, match=re.escape(words)):
+        lc.load_intrinsics(written(tmp_path, "opencv.yml", OPENCV.replace(old, new)))
 
 
 @pytest.mark.parametrize("name", FILES)

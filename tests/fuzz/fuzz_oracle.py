@@ -20,7 +20,11 @@ from typing import Any, TextIO
 # of processor time, as other work may share the machine; of the clock six times that
 LIMIT_S, PATIENCE = 10.0, 6.0
 _LONGEST_LINE, _MOST_TEXT = 2000, 20_000
-_LINE = re.compile(r"(Error|Warning|Usage|Try|Traceback|Interrupted|Going on|Ended|Saved|Alarm)")
+# of several captures each line names its own
+_ERROR = re.compile(r"(.*: )?Error: ")
+_LINE = re.compile(
+    r"((.*: )?Error|Warning|Usage|Try|Traceback|Interrupted|Going on|Ended|Saved|Alarm)"
+)
 # what `judge` and `watch` say in other words
 _VERDICT = re.compile(r"Verdict: bad|ALARM open")
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
@@ -146,7 +150,7 @@ def _words(outcome: Outcome, args: Sequence[str]) -> Iterator[str]:
     if outcome.status not in (0, 1, 2):
         yield f"status {outcome.status}"
     lines = [line for line in outcome.err.split("\n") if line]
-    told = any(line.startswith("Error: ") for line in lines)
+    told = any(_ERROR.match(line) for line in lines)
     if outcome.status == 1 and not (told or _VERDICT.search(outcome.out + outcome.err)):
         yield "status 1 without a line 'Error: ...'"
     if outcome.status in (0, 1):
