@@ -12,7 +12,7 @@ from lasercal_gtsam.closed_form.camera import KnownIntrinsics
 from lasercal_gtsam.closed_form.complete import SPOTS_FOR_PLANE, complete_cell, is_complete
 from lasercal_gtsam.closed_form.groups import GROUP_TOLERANCE_RAD, thinned
 from lasercal_gtsam.closed_form.information import check_information
-from lasercal_gtsam.closed_form.outliers import set_aside, solve_pair_without_outliers
+from lasercal_gtsam.closed_form.outliers import Mask, set_aside, solve_pair_without_outliers
 from lasercal_gtsam.closed_form.pair import PairCandidate
 from lasercal_gtsam.closed_form.solution import NEGATIVE_DEPTH_PENALTY_PX, cell_reprojection
 from lasercal_gtsam.closed_form.spots import Index, Spots, pairs_of, pixel_scaling
@@ -118,28 +118,21 @@ def closed_form_candidates(
     if not pairs:
         raise DegenerateError("\n".join(reasons) or "there are no spots")
     pairs.sort(key=lambda pair: len(pair.spots))
-    agreed = np.ones(len(observations), dtype=bool)
-    for pair in pairs:
-        agreed[pair.aside] = False
-    used = agreed.copy()
-    for p in range(len(observations.planes)):
-        mine = observations.plane_index == p
-        if agreed[mine].sum() < SPOTS_FOR_PLANE:  # found, at worst, from all that there are
-            used[mine] = True
+    agreed, used = _agreed_and_used(observations, pairs)
     left_out = tuple(str(name) for name in observations.id[~used])
-    judges, some = observations[agreed], observations[used]
+    judges, usable = observations[agreed], observations[used]
     candidates: list[Candidate] = []
     refusal: DegenerateError | None = None
     for k in range(min(MAX_CANDIDATES, max(len(pair.found) for pair in pairs))):
         chosen = [pair.found[min(k, len(pair.found) - 1)] for pair in pairs]
         cell = _merged(pairs, chosen)
-        whole = is_complete(cell, some)
+        whole = is_complete(cell, usable)
         # what the better start could not complete, a worse one completes from its errors only
         if refusal and not whole:
             continue
         if not whole:
             try:
-                cell = complete_cell(cell, some, known, reasons)
+                cell = complete_cell(cell, usable, known, reasons)
             except DegenerateError as error:
                 refusal = error
                 continue
@@ -150,6 +143,19 @@ def closed_form_candidates(
     candidates.sort(key=lambda candidate: candidate.rank)
     check_information(candidates[0].cell, observations, known, candidates[0].rms_px)
     return tuple(candidates)
+
+
+def _agreed_and_used(observations: Observations, pairs: list[_Pair]) -> tuple[Mask, Mask]:
+    """Which spots agree, (N,), and these with all of the planes that they could not give."""
+    agreed = np.ones(len(observations), dtype=np.bool_)
+    for pair in pairs:
+        agreed[pair.aside] = False
+    used = agreed.copy()
+    for p in range(len(observations.planes)):
+        mine = observations.plane_index == p
+        if agreed[mine].sum() < SPOTS_FOR_PLANE:
+            used[mine] = True
+    return agreed, used
 
 
 def known_intrinsics(

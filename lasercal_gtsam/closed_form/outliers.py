@@ -94,14 +94,16 @@ def solve_pair_without_outliers(
         return start.found, nothing
     agreed = solver.from_agreement(groups)
     if start is None and (agreed is None or agreed.fit <= _USABLE * len(agreed.rows)):
-        start = solver.solve(everything, search=True)
+        try:
+            start = solver.judged(solve_pair(spots, groups, known), everything)
+        except DegenerateError:
+            if agreed is None:
+                raise
         if start is not None and within(start.distances, SUSPICIOUS).all():
             return start.found, nothing
     if start is None or (agreed is not None and agreed.fit > start.fit):
         start = agreed
-    if start is None:
-        solve_pair(spots, groups, known)  # says what is missing
-        raise AssertionError("solved the second time")
+    assert start is not None
     start = solver.rounds(start)
     if len(start.rows) == len(spots):
         return start.found, set_aside(start.found[0].solution, spots)
@@ -146,9 +148,12 @@ class _Solver:
         some = self.spots.subset(rows)
         groups = find_groups(some, self.group_tolerance_rad)
         try:
-            found = solve_pair(some, groups, self.known, search=search)
+            return self.judged(solve_pair(some, groups, self.known, search=search), rows)
         except DegenerateError:
             return None
+
+    def judged(self, found: list[PairCandidate], rows: Index) -> _Start:
+        """Solutions of some spots, which of them most of all spots fit, and how far they are."""
         if len(rows) < len(self.spots):
             found = [self.completed(one) for one in found[:_JUDGED]] + found[_JUDGED:]
         distances = [spot_distances(one.solution, self.spots) for one in found[:_JUDGED]]

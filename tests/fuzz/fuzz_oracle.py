@@ -27,6 +27,8 @@ _LINE = re.compile(
 )
 # what `judge` and `watch` say in other words
 _VERDICT = re.compile(r"Verdict: bad|ALARM open")
+# of a history: words out of its file
+_EVENT = re.compile(r"  \d+: ")
 _CONTROL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f]")
 _NOT_A_NUMBER = re.compile(r"(?<![\w/.'-])(?<!plane )[-+]?(nan|inf)(?![\w/.'-])", re.IGNORECASE)
 
@@ -186,7 +188,7 @@ def _not_numbers(out: str) -> Iterator[str]:
                 json.loads(line, parse_constant=_refuse)
             except ValueError as error:
                 yield f"stdout: {error}"[:200]
-        elif match := _NOT_A_NUMBER.search(line):
+        elif (match := _NOT_A_NUMBER.search(line)) and not _EVENT.match(line):
             yield f"stdout: {match[0]} in {line.strip()!r}"[:200]
 
 
