@@ -79,6 +79,7 @@ class Limits(FrozenData):
             problems.append(f"posture: expected a rotation matrix, got {R.tolist()}")
         if problems:
             raise DataError(*(f"plan: {p}" for p in problems))
+        object.__setattr__(self, "roll", self.roll + 0.0)  # no -0.0: no range ends there
 
     def allow(self, cell: Cell, camera: str, plane: str, T_base_hand: Array) -> Mask:
         """Which of the poses (N, 4, 4) the hand may take to point at ``plane``, (N,)."""

@@ -263,6 +263,11 @@ def test_hands_go_a_short_way(forty):
     assert turns == different - 1
 
 
+def test_a_hand_that_may_not_turn_at_all():
+    planned = [plan(CELL, count=4, limits=Limits(roll=roll)) for roll in (0.0, -0.0)]
+    np.testing.assert_array_equal(planned[0].T_base_hand, planned[1].T_base_hand)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
