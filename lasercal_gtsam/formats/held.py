@@ -66,10 +66,9 @@ def covariance_difference(found: Array, wanted: Array) -> float:
     stands for "not known", equals NaN.
     """
     sigma = np.sqrt(np.abs(np.diag(wanted)))
-    scale = np.outer(sigma, sigma)
     same = (found == wanted) | (np.isnan(found) & np.isnan(wanted))
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.where(same, 0.0, np.abs(found - wanted) / scale)
+        ratio = np.where(same, 0.0, np.abs(found - wanted) / np.outer(sigma, sigma))
     return float(np.max(ratio, initial=0.0))
 
 

@@ -447,10 +447,12 @@ class CalibrationModel(CellModel):
 
 def _may_be_covariance(C: Array) -> bool:
     """Whether it is one up to rounding; not known of one with NaN (no degrees of freedom)."""
+    variances = np.diag(C)
+    if (variances < 0.0).any():
+        return False
     if not np.isfinite(C).all():
         return True
-    variances = np.diag(C)
-    if (variances < 0.0).any() or C[variances == 0.0].any():
+    if C[variances == 0.0].any():
         return False
     root = np.sqrt(variances)
     scale = np.divide(1.0, root, out=np.zeros_like(root), where=root > 0.0)

@@ -353,10 +353,10 @@ def test_covariance_must_fit_its_labels(saved: tuple[Path, dict]) -> None:
 
 @pytest.mark.parametrize(
     ("row", "column", "value"),
-    [(2, 2, -1.0), (0, 1, 1e3), (0, 1, 1e308), (3, 3, 0.0), (1, 1, 1e-9)],
+    [(2, 2, -1.0), (2, 2, "-inf"), (0, 1, 1e3), (0, 1, 1e308), (3, 3, 0.0), (1, 1, 1e-9)],
 )
 def test_what_is_no_covariance(
-    saved: tuple[Path, dict], row: int, column: int, value: float
+    saved: tuple[Path, dict], row: int, column: int, value: float | str
 ) -> None:
     path, data = saved
     matrix = data["covariance"]["matrix"]

@@ -165,7 +165,9 @@ def _words(outcome: Outcome, args: Sequence[str]) -> Iterator[str]:
         yield "stderr: control characters"
     if len(outcome.err) > _MOST_TEXT or any(len(line) > _LONGEST_LINE for line in lines):
         yield "stderr: too long to read"
-    if not {"nan", "inf"} & {str(arg).lower().lstrip("+-") for arg in args}:  # as names of files
+    if not {"nan", "inf", "infinity"} & {
+        str(arg).lower().lstrip("+-") for arg in args
+    }:  # as names of files
         yield from _not_numbers(outcome.out)
 
 
