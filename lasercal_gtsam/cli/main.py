@@ -86,6 +86,7 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         status = cli.main(args=args, prog_name="lasercal", standalone_mode=False)
     except click.ClickException as error:
+        error.message = "\n".join(_visible(line) for line in error.message.split("\n"))
         error.show()
         return error.exit_code
     except click.Abort:
@@ -96,7 +97,7 @@ def main(args: Sequence[str] | None = None) -> int:
             click.echo(f"Error: {_visible(line)}", err=True)
         return FAILED
     except OSError as error:  # a full disk, a terminal that is gone
-        click.echo(f"Error: {error}", err=True)
+        click.echo(f"Error: {_visible(str(error))}", err=True)
         return FAILED
     return status if isinstance(status, int) else 0
 

@@ -190,3 +190,15 @@ def test_a_name_the_terminal_cannot_show_is_escaped():
 def test_a_missing_capture_is_one_line_and_status_1(tmp_path):
     outcome = in_fresh_process("calibrate", "nowhere", cwd=tmp_path)
     assert outcome == (1, "", "Error: nowhere: there is no such file or folder\n")
+
+
+@pytest.mark.parametrize(
+    "args",
+    [("a\x1b[31mb",), ("plan", "x", "\r"), ("simulate", "x", "--seed", "\x1b[2J")],
+)
+def test_what_a_terminal_would_obey_is_shown_instead(lasercal, args):
+    outcome = lasercal(*args)
+    assert outcome.status == 2
+    told = outcome.err
+    assert not any(c in told for c in "\r\x1b")
+    assert r"\x1b[" in told or r"\r" in told
