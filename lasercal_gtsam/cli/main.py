@@ -86,8 +86,10 @@ def main(args: Sequence[str] | None = None) -> int:
     try:
         status = cli.main(args=args, prog_name="lasercal", standalone_mode=False)
     except click.ClickException as error:
-        error.message = "\n".join(_visible(line) for line in error.message.split("\n"))
-        error.show()
+        told = io.StringIO()
+        error.show(told)
+        for line in told.getvalue().removesuffix("\n").split("\n"):
+            click.echo(_visible(line), err=True)
         return error.exit_code
     except click.Abort:
         click.echo("Interrupted: nothing was saved half written.", err=True)

@@ -237,7 +237,7 @@ def test_observations_say_what_is_wrong_and_where(changes, words):
         ({"sigma_px": "1"}, ["options.sigma_px"]),
         ({"hand_sigma_m": -1e-3}, ["options.hand_sigma_m"]),
         ({"hand_sigma_rad": np.nan}, ["options.hand_sigma_rad"]),
-        ({"max_iterations": 0}, ["options.max_iterations", ">= 1"]),
+        ({"max_iterations": 0}, ["options.max_iterations", "from 1 to 1000000"]),
         ({"fixed": "u0"}, ["options.fixed", "tuple"]),
         ({"known": ["skew"]}, ["options.known", "dict"]),
         ({"priors": [("u0", 1)]}, ["options.priors", "dict"]),
