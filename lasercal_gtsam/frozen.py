@@ -59,7 +59,7 @@ def set_array(
     value: Any,
     shape: tuple[int | None, ...],
     finite: bool = True,
-    largest: float = np.inf,
+    largest: float | None = None,
 ) -> Array:
     """Store ``value`` on a frozen dataclass as a read-only float64 array of the given shape.
 
@@ -80,7 +80,7 @@ def set_array(
     if finite and not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         raise DataError(f"{where}: expected finite numbers, got {array[index]} at index {index}")
-    if (too_large := np.abs(array) > largest).any():
+    if largest is not None and (too_large := np.abs(array) > largest).any():
         index = tuple(int(i) for i in np.argwhere(too_large)[0])
         raise DataError(
             f"{where}: expected numbers up to {largest:g}, got {array[index]:g} at index {index}"

@@ -263,9 +263,7 @@ def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFac
     tied = [at for at, aspect in zip(focal, chart.aspects, strict=True) if aspect is not None]
     held[tied] = True
 
-    def error(values: Any) -> Array:
-        z = values.atVector(CELL_KEY)
-        K = chart.intrinsics(z)
+    def residuals(z: Array, K: Array) -> Array:
         e = np.full(len(holds.priors), np.inf)
         if not np.all(K[:, :2] > 0):
             return e
@@ -276,6 +274,10 @@ def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFac
                 fu, fv = K[aspects[name], :2]
                 e[r] = np.log(fu / fv / mean) * mean / sigma
         return e
+
+    def error(values: Any) -> Array:
+        z = values.atVector(CELL_KEY)
+        return residuals(z, chart.intrinsics(z))
 
     def linearize(values: Any) -> tuple[Array, list[Array]]:
         z = values.atVector(CELL_KEY)
@@ -292,7 +294,7 @@ def prior_factor(chart: CellChart, holds: Holds, start: Cell) -> gtsam.CustomFac
             if aspect is not None:
                 J[:, at + 1] += aspect * J[:, at]
         J[:, held] = 0.0
-        return error(values), [J]
+        return residuals(z, K), [J]
 
     noise = gtsam.noiseModel.Unit.Create(len(holds.priors))
     return custom_factor("priors", noise, [CELL_KEY], [chart.n], error, linearize)

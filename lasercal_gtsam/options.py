@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 from lasercal_gtsam.errors import DataError
@@ -126,7 +126,7 @@ def _number_problems(options: CalibrationOptions) -> list[str]:
             and 1 <= options.max_iterations <= _MOST_ITERATIONS,
             f"an integer from 1 to {_MOST_ITERATIONS}",
         ),
-        "seed": (isinstance(options.seed, int) and options.seed >= 0, "an integer >= 0"),
+        "seed": (isinstance(options.seed, Integral) and options.seed >= 0, "an integer >= 0"),
     }
     return [
         f"options.{name}: expected {what}, got {getattr(options, name)!r}"

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
-
 import click
 
+from lasercal_gtsam.cli.console import F
 from lasercal_gtsam.cli.values import RotationName
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 
 def pose_options(function: F) -> F:

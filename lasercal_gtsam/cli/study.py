@@ -8,11 +8,19 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from lasercal_gtsam.cli.console import json_option, print_json, progress, seed_option, warn, wrapped
+from lasercal_gtsam.cli.console import (
+    F,
+    json_option,
+    print_json,
+    progress,
+    seed_option,
+    warn,
+    wrapped,
+)
 from lasercal_gtsam.cli.values import Names, Numbers
 from lasercal_gtsam.errors import DataError
 
@@ -21,7 +29,6 @@ if TYPE_CHECKING:
     from lasercal_gtsam.engine import Workers
     from lasercal_gtsam.study import Study
 
-F = TypeVar("F", bound=Callable[..., Any])
 
 _FAMILIES = ("M1", "M2", "M3", "M4")
 

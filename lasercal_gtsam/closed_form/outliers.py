@@ -106,7 +106,7 @@ def solve_pair_without_outliers(
     assert start is not None
     start = solver.rounds(start)
     if len(start.rows) == len(spots):
-        return start.found, set_aside(start.found[0].solution, spots)
+        return start.found, _far(start.distances)
     if start.fit > _TELLING * len(start.rows):
         near = within(start.distances, ASIDE, start.distances[start.rows])
         return start.found, ~near | np.isnan(start.distances)
@@ -115,11 +115,14 @@ def solve_pair_without_outliers(
 
 def set_aside(solution: Solution, spots: Spots) -> Mask:
     """(N,) True for spots too far from a solution; none where no spot is `SUSPICIOUS`."""
-    distances = spot_distances(solution, spots)
-    if within(distances, SUSPICIOUS).all():
-        return np.zeros(len(spots), dtype=bool)
+    return _far(spot_distances(solution, spots))
+
+
+def _far(distances: Array) -> Mask:
     aside = ~within(distances, ASIDE)
-    return aside if aside.mean() <= MOST_ASIDE else np.zeros(len(spots), dtype=bool)
+    if within(distances, SUSPICIOUS).all() or aside.mean() > MOST_ASIDE:
+        return np.zeros(len(distances), dtype=np.bool_)
+    return aside
 
 
 def within(distances: Array, factor: float, of: Array | None = None) -> Mask:

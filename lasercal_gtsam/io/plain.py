@@ -21,7 +21,7 @@ _LINE_LENGTH = 160
 def plain(value: Any) -> Any:
     """Dicts, lists, strings and numbers; NaN becomes None, infinities "inf" and "-inf".
 
-    JSON has no NaN; None and the two words are read back by the models in `calibration_model`.
+    JSON has no NaN; None and the two words are read back by the types in `json_numbers`.
     """
     if value is None or isinstance(value, str | bool):
         return value

@@ -76,6 +76,7 @@ class MotionDesign:
             problems.append(f"centre: expected a fraction in (0, 1], got {self.centre}")
         if problems:
             raise DataError(*(f"MotionDesign.{p}" for p in problems))
+        object.__setattr__(self, "roll", self.roll + 0.0)  # no -0.0: no range ends there
 
 
 _NEAR = MotionDesign(centre=0.75, shortest=10 * M_PER_MM, longest=70 * M_PER_MM)

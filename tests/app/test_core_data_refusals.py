@@ -355,6 +355,10 @@ def test_options_keep_tuples():
     assert options.fixed == ("fu",)
 
 
+def test_a_seed_may_come_from_numpy():
+    assert lc.CalibrationOptions(seed=np.int64(3)).seed == 3
+
+
 @pytest.mark.parametrize(
     ("option", "value"),
     [
